@@ -1,0 +1,2 @@
+//! PSAO core.
+#![no_std]

@@ -1,0 +1,3 @@
+//! The PSAO reference server: `scene ─► points ─► occlusion ─► select ─► encode ─► transport`.
+
+pub mod scene;

@@ -1,0 +1,2 @@
+//! The command `psao`.
+fn main() {}
