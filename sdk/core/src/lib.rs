@@ -1,2 +1,30 @@
-//! PSAO core.
+//! PSAO core: what server and client must agree on, once.
+//!
+//! ```text
+//! stream bytes ─► stream (packets) ─► mirror (buckets, cells, instances) ─► lookup
+//! ```
+//!
+//! * [`point`], [`cell`], [`grid`]: the data of the paper (Neff et al., PSAO, section 3.2),
+//!   laid out as the client's GPU buffers hold it.
+//! * [`mirror`]: those buffers, their dirty ranges, and a hash that proves two mirrors equal.
+//! * [`stream`]: the packets of `docs/format.md`, reader and writer side by side.
+//! * [`uplink`]: what the client tells the server.
+//! * [`lookup`]: the blend of the few points around a fragment; the definition for all shaders.
+//!
+//! `no_std`, no allocation, no `unsafe`: every buffer is the caller's and is bounded before use.
 #![no_std]
+
+pub mod cell;
+pub mod dirty;
+pub mod grid;
+pub mod lookup;
+pub mod mirror;
+pub mod point;
+pub mod stream;
+pub mod uplink;
+
+pub use cell::{Bucket, Cell};
+pub use grid::Instance;
+pub use lookup::{Kernel, Lookup};
+pub use mirror::Mirror;
+pub use point::Point;

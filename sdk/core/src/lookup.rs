@@ -1,0 +1,336 @@
+//! The lookup on the CPU: the definition that every shader has to agree with to 1/255.
+//!
+//! A fragment at local position x with normal n blends the points of the 2×2×2 nearest cells of
+//! its instance's grid (paper, section 3.5). All lengths are in cells.
+
+use crate::cell::{Bucket, CELL_POINTS, Cell};
+use crate::grid::Instance;
+use crate::point::{NORMALS, decode_position};
+
+/// Eq. 3: points whose normal differs more than this (as a dot product) do not count.
+pub const T_N: f32 = 0.1;
+
+/// Eq. 3: points that lie this much above or below their own plane do not count.
+pub const T_D: f32 = 0.7;
+
+/// Half-width of the plane band of [`Kernel::Planar`], in radii.
+pub const PLANE_BAND: f32 = 0.3;
+
+/// How the points around a fragment are weighted.
+#[repr(u8)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Kernel {
+    /// The paper's, Eq. 2 to 4; 1 where no point counts.
+    Paper = 0,
+    /// (1 − d²/r²) · max(0, 1 − (h/0.3r)²) · max(0, n·nₚ)⁸ with h = max(|n·d|, |nₚ·d|) and
+    /// n·nₚ > T_n; where no point counts, the nearest fetched point.
+    #[default]
+    Planar = 1,
+}
+
+/// The buffers a lookup reads.
+#[derive(Clone, Copy, Debug)]
+pub struct Lookup<'a> {
+    /// Instance buffer.
+    pub instances: &'a [Instance],
+    /// Bucket buffer.
+    pub buckets: &'a [Bucket],
+    /// Cell buffer.
+    pub cells: &'a [Cell],
+}
+
+/// What a lookup found.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Answer {
+    /// 1 is open, 0 fully occluded. Never NaN.
+    pub openness: f32,
+    /// Sum of the weights; 0 where no point counted (a hole).
+    pub weight: f32,
+    /// Points read.
+    pub fetched: u32,
+}
+
+impl Answer {
+    const OPEN: Answer = Answer {
+        openness: 1.0,
+        weight: 0.0,
+        fetched: 0,
+    };
+}
+
+type Vec3 = [f32; 3];
+
+fn dot(a: Vec3, b: Vec3) -> f32 {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+impl Lookup<'_> {
+    /// Blends the points around a fragment.
+    ///
+    /// `position`, `normal` (any length): in the instance's local space. Unknown instances,
+    /// instances without points, positions outside the grid and non-finite input answer 1; a zero
+    /// normal agrees with no point, so `Paper` answers 1 and `Planar` the nearest point.
+    pub fn blend(&self, kernel: Kernel, instance: u32, position: Vec3, normal: Vec3) -> Answer {
+        let Some(grid) = self.instances.get(instance as usize) else {
+            return Answer::OPEN;
+        };
+        if grid.bucket_count == 0 {
+            return Answer::OPEN;
+        }
+        let g = grid.to_cells(position);
+        let Some(normal) = to_cell_space(normal, grid) else {
+            return Answer::OPEN;
+        };
+        // The block's lower cell, −1 at least, and the fragment's place seen from it, 0.5..1.5.
+        let mut base = [0i32; 3];
+        let mut place = [0.0f32; 3];
+        for axis in 0..3 {
+            if !(g[axis] >= -0.5 && g[axis] < grid.dims[axis] as f32 + 0.5) {
+                return Answer::OPEN;
+            }
+            let lower = libm::floorf(g[axis] - 0.5);
+            base[axis] = lower as i32;
+            place[axis] = g[axis] - lower;
+        }
+        let mut blend = Blend::new(kernel, grid.radius, normal);
+        for corner in 0..8i32 {
+            let offset = [corner & 1, corner >> 1 & 1, corner >> 2];
+            // −1 becomes a large number: below the grid is out of range too.
+            let cell: [u32; 3] = core::array::from_fn(|axis| (base[axis] + offset[axis]) as u32);
+            if (0..3).any(|axis| cell[axis] >= grid.dims[axis]) {
+                continue;
+            }
+            let Some(found) = self.find(grid, cell) else {
+                continue;
+            };
+            let from = core::array::from_fn(|axis| offset[axis] as f32 - place[axis]);
+            blend.add_cell(found, from);
+        }
+        blend.answer()
+    }
+
+    /// The cell at a grid coordinate: hash, then search its bucket for the key.
+    pub fn find(&self, grid: &Instance, cell: [u32; 3]) -> Option<&Cell> {
+        let key = grid.key(cell);
+        let bucket = self.buckets.get(grid.bucket(cell) as usize)?;
+        bucket.cells().find_map(|entry| {
+            let cell = self.cells.get(entry as usize)?;
+            (cell.key == key).then_some(cell)
+        })
+    }
+}
+
+/// The fragment's unit normal in cell space; zero for a zero one, none for a non-finite one.
+fn to_cell_space(normal: Vec3, grid: &Instance) -> Option<Vec3> {
+    let largest = normal.iter().fold(0.0f32, |m, v| m.max(v.abs()));
+    if !normal.iter().all(|v| v.is_finite()) {
+        return None;
+    }
+    if largest == 0.0 {
+        return Some([0.0; 3]);
+    }
+    // Divided by the largest first, so that no square over- or underflows.
+    let n: Vec3 = core::array::from_fn(|axis| normal[axis] / largest * grid.normal_scale[axis]);
+    let squared = dot(n, n);
+    if squared == 0.0 {
+        return Some([0.0; 3]);
+    }
+    let scale = 1.0 / libm::sqrtf(squared);
+    Some([n[0] * scale, n[1] * scale, n[2] * scale])
+}
+
+struct Blend {
+    kernel: Kernel,
+    normal: Vec3,
+    radius: f32,
+    inverse_radius_squared: f32,
+    inverse_band_squared: f32,
+    weight: f32,
+    sum: f32,
+    fetched: u32,
+    nearest: f32,
+    nearest_squared: f32,
+}
+
+impl Blend {
+    fn new(kernel: Kernel, radius: f32, normal: Vec3) -> Blend {
+        let band = PLANE_BAND * radius;
+        Blend {
+            kernel,
+            normal,
+            radius,
+            inverse_radius_squared: 1.0 / (radius * radius),
+            inverse_band_squared: 1.0 / (band * band),
+            weight: 0.0,
+            sum: 0.0,
+            fetched: 0,
+            nearest: 1.0,
+            nearest_squared: f32::INFINITY,
+        }
+    }
+
+    /// Adds a cell's points; `from` is the vector from the fragment to the cell's lower corner.
+    fn add_cell(&mut self, cell: &Cell, from: Vec3) {
+        for point in cell
+            .points
+            .iter()
+            .take(CELL_POINTS)
+            .take_while(|p| p.is_allocated())
+        {
+            let step = point.position();
+            let d: Vec3 = core::array::from_fn(|axis| from[axis] + decode_position(step[axis]));
+            let point_normal = NORMALS[point.normal() as usize];
+            let openness = f32::from(point.occlusion()) * (1.0 / 255.0);
+            let squared = dot(d, d);
+            self.fetched += 1;
+            if squared < self.nearest_squared {
+                self.nearest_squared = squared;
+                self.nearest = openness;
+            }
+            let weight = match self.kernel {
+                Kernel::Paper => self.paper(d, squared, point_normal),
+                Kernel::Planar => self.planar(d, squared, point_normal),
+            };
+            self.weight += weight;
+            self.sum += weight * openness;
+        }
+    }
+
+    /// Eq. 2 and 3.
+    fn paper(&self, d: Vec3, squared: f32, point_normal: Vec3) -> f32 {
+        let distance = libm::sqrtf(squared);
+        let along = dot(point_normal, d);
+        if dot(point_normal, self.normal) <= T_N || along * along >= T_D * squared && squared > 0.0
+        {
+            return 0.0;
+        }
+        ((self.radius - distance) / self.radius).max(0.0)
+    }
+
+    fn planar(&self, d: Vec3, squared: f32, point_normal: Vec3) -> f32 {
+        let agree = dot(point_normal, self.normal);
+        if agree <= T_N {
+            return 0.0;
+        }
+        let h = dot(self.normal, d).abs().max(dot(point_normal, d).abs());
+        let near = (1.0 - squared * self.inverse_radius_squared).max(0.0);
+        let flat = (1.0 - h * h * self.inverse_band_squared).max(0.0);
+        let agree2 = agree * agree;
+        let agree4 = agree2 * agree2;
+        near * flat * agree4 * agree4
+    }
+
+    /// Eq. 4, and the nearest point for a planar hole.
+    fn answer(&self) -> Answer {
+        let openness = if self.weight > 0.0 {
+            // The quotient of two sums may round past the largest value blended.
+            (self.sum / self.weight).min(1.0)
+        } else if self.kernel == Kernel::Planar {
+            self.nearest
+        } else {
+            1.0
+        };
+        Answer {
+            openness,
+            weight: self.weight,
+            fetched: self.fetched,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::point::{Point, encode_normal};
+
+    /// One instance of 4×4×4 cells of unit size, one cell filled.
+    fn scene(cell: [u32; 3], points: &[Point]) -> (Instance, [Bucket; 16], [Cell; 2]) {
+        let mut grid = Instance {
+            radius: 0.8,
+            cells_per_unit: [1.0; 3],
+            dims: [4; 3],
+            bucket_count: 16,
+            normal_scale: [1.0; 3],
+            ..Instance::default()
+        };
+        grid.set_strides();
+        let mut buckets = [Bucket::default(); 16];
+        buckets[grid.bucket(cell) as usize].entries[0] = 1;
+        let mut cells = [Cell::default(); 2];
+        cells[1].key = grid.key(cell);
+        cells[1].points[..points.len()].copy_from_slice(points);
+        (grid, buckets, cells)
+    }
+
+    fn up(occlusion: u8) -> Point {
+        Point::pack([16, 0, 16], encode_normal([0.0, 1.0, 0.0]), occlusion)
+    }
+
+    #[test]
+    fn a_point_is_seen_from_the_blocks_that_hold_its_cell() {
+        let (grid, buckets, cells) = scene([1, 1, 1], &[up(51)]);
+        let lookup = Lookup {
+            instances: &[grid],
+            buckets: &buckets,
+            cells: &cells,
+        };
+        for kernel in [Kernel::Paper, Kernel::Planar] {
+            let here = lookup.blend(kernel, 0, [1.4, 1.01, 1.6], [0.0, 2.0, 0.0]);
+            assert!(
+                (here.openness - 0.2).abs() < 1e-6 && here.weight > 0.0,
+                "{here:?}"
+            );
+            let far = lookup.blend(kernel, 0, [3.5, 1.0, 1.5], [0.0, 1.0, 0.0]);
+            assert_eq!((far.openness, far.fetched), (1.0, 0));
+            let other_side = lookup.blend(kernel, 0, [1.4, 1.01, 1.6], [0.0, -1.0, 0.0]);
+            assert_eq!(other_side.weight, 0.0);
+        }
+        let hole = lookup.blend(Kernel::Planar, 0, [1.4, 1.01, 1.6], [0.0, -1.0, 0.0]);
+        assert!(
+            (hole.openness - 0.2).abs() < 1e-6,
+            "planar falls back to the nearest"
+        );
+    }
+
+    #[test]
+    fn no_input_gives_nan_or_a_panic() {
+        let (mut grid, buckets, cells) = scene([0, 0, 0], &[up(0); 7]);
+        let odd = [
+            f32::NAN,
+            f32::INFINITY,
+            f32::NEG_INFINITY,
+            0.0,
+            -0.0,
+            1e38,
+            -1e38,
+            1e-45,
+            0.5,
+        ];
+        for radius in [0.8, 1e-38, 1e30] {
+            grid.radius = radius;
+            let lookup = Lookup {
+                instances: &[grid],
+                buckets: &buckets,
+                cells: &cells,
+            };
+            for kernel in [Kernel::Paper, Kernel::Planar] {
+                for a in odd {
+                    for b in odd {
+                        for (position, normal) in [
+                            ([a, b, 0.5], [0.0, 1.0, 0.0]),
+                            ([0.5, 0.1, 0.5], [a, b, 0.0]),
+                        ] {
+                            let answer = lookup.blend(kernel, 0, position, normal);
+                            assert!((0.0..=1.0).contains(&answer.openness), "{answer:?}");
+                            let finite = |v: Vec3| v.iter().all(|v| v.is_finite());
+                            if !(finite(position) && finite(normal)) {
+                                assert_eq!(answer.openness, 1.0);
+                            }
+                        }
+                    }
+                }
+                assert_eq!(lookup.blend(kernel, 9, [0.0; 3], [0.0; 3]), Answer::OPEN);
+            }
+        }
+    }
+}

@@ -1,0 +1,470 @@
+//! The mirror: the client's instances, buckets and cells. The server holds an exact copy of what
+//! each client has, changed by the same functions, so both always agree to the bit.
+
+use crate::cell::{Bucket, Cell};
+use crate::dirty;
+use crate::grid::{GridError, Instance};
+use crate::lookup::Lookup;
+use core::ops::Range;
+
+/// How many of each the mirror has room for.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Capacity {
+    /// Instances.
+    pub instances: u32,
+    /// Buckets, all instances together.
+    pub buckets: u32,
+    /// Cells, all instances together, and the unused cell 0.
+    pub cells: u32,
+}
+
+impl Capacity {
+    /// Words of [`PartsMut::dirty`].
+    pub const fn dirty_words(&self) -> usize {
+        dirty::words(self.instances as usize)
+            + dirty::words(self.buckets as usize)
+            + dirty::words(self.cells as usize)
+    }
+
+    /// Bytes of the three buffers and the dirty sets.
+    pub const fn bytes(&self) -> u64 {
+        self.instances as u64 * size_of::<Instance>() as u64
+            + self.buckets as u64 * size_of::<Bucket>() as u64
+            + self.cells as u64 * size_of::<Cell>() as u64
+            + self.dirty_words() as u64 * 8
+    }
+}
+
+/// One of the mirror's buffers.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Buffer {
+    /// [`Instance`]s, 80 bytes each.
+    Instances,
+    /// [`Bucket`]s, 32 bytes each.
+    Buckets,
+    /// [`Cell`]s, 32 bytes each.
+    Cells,
+}
+
+/// Memory lent to a mirror: the caller's, fixed in size.
+pub trait Memory {
+    /// The buffers, to read.
+    fn parts(&self) -> Parts<'_>;
+    /// The buffers, to write.
+    fn parts_mut(&mut self) -> PartsMut<'_>;
+}
+
+/// A mirror's buffers, to read.
+#[derive(Clone, Copy)]
+pub struct Parts<'a> {
+    /// Instance buffer.
+    pub instances: &'a [Instance],
+    /// Bucket buffer.
+    pub buckets: &'a [Bucket],
+    /// Cell buffer.
+    pub cells: &'a [Cell],
+    /// The three dirty sets, in this order; [`Capacity::dirty_words`] long.
+    pub dirty: &'a [u64],
+}
+
+/// A mirror's buffers, to write.
+pub struct PartsMut<'a> {
+    /// Instance buffer.
+    pub instances: &'a mut [Instance],
+    /// Bucket buffer.
+    pub buckets: &'a mut [Bucket],
+    /// Cell buffer.
+    pub cells: &'a mut [Cell],
+    /// The three dirty sets, in this order; [`Capacity::dirty_words`] long.
+    pub dirty: &'a mut [u64],
+}
+
+/// Why a change was refused. The mirror is as before.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum MirrorError {
+    /// An index is outside its buffer.
+    Index,
+    /// A bucket names a cell that is not there.
+    Entry,
+    /// An instance cannot be used.
+    Grid(GridError),
+}
+
+/// Instances, buckets and cells, what of them changed since the last [`Mirror::clear_dirty`], and
+/// a hash of it all.
+#[derive(Debug)]
+pub struct Mirror<M> {
+    memory: M,
+    hash: u64,
+}
+
+/// Buffers borrowed from the caller.
+pub struct Borrowed<'a>(pub PartsMut<'a>);
+
+impl Memory for Borrowed<'_> {
+    fn parts(&self) -> Parts<'_> {
+        let PartsMut {
+            instances,
+            buckets,
+            cells,
+            dirty,
+        } = &self.0;
+        Parts {
+            instances,
+            buckets,
+            cells,
+            dirty,
+        }
+    }
+
+    fn parts_mut(&mut self) -> PartsMut<'_> {
+        let PartsMut {
+            instances,
+            buckets,
+            cells,
+            dirty,
+        } = &mut self.0;
+        PartsMut {
+            instances,
+            buckets,
+            cells,
+            dirty,
+        }
+    }
+}
+
+impl<M: Memory> Mirror<M> {
+    /// An empty mirror in `memory`, which is zeroed.
+    ///
+    /// # Panics
+    /// If the dirty sets are not [`Capacity::dirty_words`] long.
+    pub fn new(memory: M) -> Mirror<M> {
+        let mut mirror = Mirror { memory, hash: 0 };
+        let words = mirror.capacity().dirty_words();
+        assert_eq!(
+            mirror.memory.parts().dirty.len(),
+            words,
+            "length of the dirty sets"
+        );
+        mirror.memory.parts_mut().dirty.fill(0);
+        mirror.reset();
+        mirror
+    }
+
+    /// How many of each it has room for.
+    pub fn capacity(&self) -> Capacity {
+        let parts = self.memory.parts();
+        Capacity {
+            instances: parts.instances.len() as u32,
+            buckets: parts.buckets.len() as u32,
+            cells: parts.cells.len() as u32,
+        }
+    }
+
+    /// Back to the state after [`Mirror::new`], with everything that changes by it dirty.
+    pub fn reset(&mut self) {
+        let capacity = self.capacity();
+        let PartsMut {
+            instances,
+            buckets,
+            cells,
+            dirty,
+        } = self.memory.parts_mut();
+        let (instance_set, bucket_set, cell_set) = split_sets(dirty, capacity);
+        reset_all(instances, instance_set);
+        reset_all(buckets, bucket_set);
+        reset_all(cells, cell_set);
+        self.hash = 0;
+    }
+
+    /// Sets one instance.
+    pub fn set_instance(&mut self, index: u32, value: Instance) -> Result<(), MirrorError> {
+        let capacity = self.capacity();
+        if index >= capacity.instances {
+            return Err(MirrorError::Index);
+        }
+        value
+            .validate(capacity.buckets)
+            .map_err(MirrorError::Grid)?;
+        let parts = self.memory.parts_mut();
+        let (set, _, _) = split_sets(parts.dirty, capacity);
+        replace(parts.instances, set, index, value, 1, &mut self.hash);
+        Ok(())
+    }
+
+    /// Sets one bucket.
+    pub fn set_bucket(&mut self, index: u32, value: Bucket) -> Result<(), MirrorError> {
+        let capacity = self.capacity();
+        if index >= capacity.buckets {
+            return Err(MirrorError::Index);
+        }
+        if value
+            .entries
+            .iter()
+            .any(|&entry| entry != 0 && entry >= capacity.cells)
+        {
+            return Err(MirrorError::Entry);
+        }
+        let parts = self.memory.parts_mut();
+        let (_, set, _) = split_sets(parts.dirty, capacity);
+        replace(parts.buckets, set, index, value, 2, &mut self.hash);
+        Ok(())
+    }
+
+    /// Sets one cell. Any content is harmless to a reader.
+    pub fn set_cell(&mut self, index: u32, value: Cell) -> Result<(), MirrorError> {
+        let capacity = self.capacity();
+        if index >= capacity.cells {
+            return Err(MirrorError::Index);
+        }
+        let parts = self.memory.parts_mut();
+        let (_, _, set) = split_sets(parts.dirty, capacity);
+        replace(parts.cells, set, index, value, 3, &mut self.hash);
+        Ok(())
+    }
+
+    /// The instance buffer.
+    pub fn instances(&self) -> &[Instance] {
+        self.memory.parts().instances
+    }
+
+    /// The bucket buffer.
+    pub fn buckets(&self) -> &[Bucket] {
+        self.memory.parts().buckets
+    }
+
+    /// The cell buffer.
+    pub fn cells(&self) -> &[Cell] {
+        self.memory.parts().cells
+    }
+
+    /// A hash of all contents, kept up to date with every change: equal contents at equal indices
+    /// have equal hashes, whatever the order in which they came and whatever the capacity.
+    pub fn hash(&self) -> u64 {
+        self.hash
+    }
+
+    /// The same hash, computed from the contents.
+    pub fn recompute_hash(&self) -> u64 {
+        fn sum<T: bytemuck::Pod>(values: &[T], kind: u64) -> u64 {
+            let parts = values
+                .iter()
+                .enumerate()
+                .map(|(i, v)| element_hash(v, i as u32, kind));
+            parts.fold(0, u64::wrapping_add)
+        }
+        let parts = self.memory.parts();
+        sum(parts.instances, 1)
+            .wrapping_add(sum(parts.buckets, 2))
+            .wrapping_add(sum(parts.cells, 3))
+    }
+
+    /// The next run of elements of `buffer` at or after `from` that changed since
+    /// [`Mirror::clear_dirty`]: what has to be uploaded.
+    pub fn next_dirty(&self, buffer: Buffer, from: u32) -> Option<Range<u32>> {
+        let (set, len) = self.dirty_set(buffer);
+        dirty::next_run(set, len, from as usize).map(|run| run.start as u32..run.end as u32)
+    }
+
+    /// All runs of changed elements of `buffer`.
+    pub fn dirty_runs(&self, buffer: Buffer) -> impl Iterator<Item = Range<u32>> + '_ {
+        let (set, len) = self.dirty_set(buffer);
+        dirty::runs(set, len).map(|run| run.start as u32..run.end as u32)
+    }
+
+    /// Everything counts as uploaded.
+    pub fn clear_dirty(&mut self) {
+        let capacity = self.capacity();
+        let (instances, buckets, cells) = split_sets(self.memory.parts_mut().dirty, capacity);
+        dirty::clear(instances, capacity.instances as usize);
+        dirty::clear(buckets, capacity.buckets as usize);
+        dirty::clear(cells, capacity.cells as usize);
+    }
+
+    /// The CPU lookup over the present contents.
+    pub fn lookup(&self) -> Lookup<'_> {
+        let Parts {
+            instances,
+            buckets,
+            cells,
+            ..
+        } = self.memory.parts();
+        Lookup {
+            instances,
+            buckets,
+            cells,
+        }
+    }
+
+    fn dirty_set(&self, buffer: Buffer) -> (&[u64], usize) {
+        let capacity = self.capacity();
+        let [instances, buckets, cells] =
+            [capacity.instances, capacity.buckets, capacity.cells].map(|len| len as usize);
+        let dirty = self.memory.parts().dirty;
+        let (instance_set, rest) = dirty.split_at(dirty::words(instances));
+        let (bucket_set, cell_set) = rest.split_at(dirty::words(buckets));
+        match buffer {
+            Buffer::Instances => (instance_set, instances),
+            Buffer::Buckets => (bucket_set, buckets),
+            Buffer::Cells => (cell_set, cells),
+        }
+    }
+}
+
+fn split_sets(dirty: &mut [u64], capacity: Capacity) -> (&mut [u64], &mut [u64], &mut [u64]) {
+    let (instances, rest) = dirty.split_at_mut(dirty::words(capacity.instances as usize));
+    let (buckets, cells) = rest.split_at_mut(dirty::words(capacity.buckets as usize));
+    (instances, buckets, cells)
+}
+
+fn reset_all<T: bytemuck::Pod>(values: &mut [T], set: &mut [u64]) {
+    let len = values.len();
+    for (index, value) in values.iter_mut().enumerate() {
+        if bytemuck::bytes_of(value).iter().any(|&byte| byte != 0) {
+            *value = T::zeroed();
+            dirty::mark(set, len, index);
+        }
+    }
+}
+
+fn replace<T: bytemuck::Pod>(
+    values: &mut [T],
+    set: &mut [u64],
+    index: u32,
+    value: T,
+    kind: u64,
+    hash: &mut u64,
+) {
+    let old = values[index as usize];
+    if bytemuck::bytes_of(&old) != bytemuck::bytes_of(&value) {
+        *hash = hash
+            .wrapping_sub(element_hash(&old, index, kind))
+            .wrapping_add(element_hash(&value, index, kind));
+        values[index as usize] = value;
+        dirty::mark(set, values.len(), index as usize);
+    }
+}
+
+/// The part of one element in the mirror's hash: 0 for an all-zero one, so that unused capacity
+/// does not count. Words are little-endian.
+fn element_hash<T: bytemuck::Pod>(value: &T, index: u32, kind: u64) -> u64 {
+    let bytes = bytemuck::bytes_of(value);
+    if bytes.iter().all(|&byte| byte == 0) {
+        return 0;
+    }
+    let mut hash = mix(kind << 32 | u64::from(index));
+    for word in bytes.chunks_exact(8) {
+        let mut le = [0; 8];
+        le.copy_from_slice(word);
+        hash = mix(hash ^ u64::from_le_bytes(le));
+    }
+    hash
+}
+
+/// The finaliser of SplitMix64.
+fn mix(mut x: u64) -> u64 {
+    x = (x ^ x >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+    x = (x ^ x >> 27).wrapping_mul(0x94d0_49bb_1331_11eb);
+    x ^ x >> 31
+}
+
+#[cfg(test)]
+mod tests {
+    extern crate std;
+    use super::*;
+    use crate::Point;
+    use std::{vec, vec::Vec};
+
+    fn with_mirror<R>(run: impl FnOnce(&mut Mirror<Borrowed<'_>>) -> R) -> R {
+        let capacity = Capacity {
+            instances: 3,
+            buckets: 70,
+            cells: 200,
+        };
+        let mut instances = vec![Instance::default(); 3];
+        let mut buckets = vec![Bucket::default(); 70];
+        let mut cells = vec![Cell::default(); 200];
+        let mut dirty = vec![0; capacity.dirty_words()];
+        run(&mut Mirror::new(Borrowed(PartsMut {
+            instances: &mut instances,
+            buckets: &mut buckets,
+            cells: &mut cells,
+            dirty: &mut dirty,
+        })))
+    }
+
+    fn cell(key: u32) -> Cell {
+        let mut cell = Cell {
+            key,
+            ..Cell::default()
+        };
+        cell.points[0] = Point::pack([1, 2, 3], 4, key as u8);
+        cell
+    }
+
+    #[test]
+    fn the_running_hash_equals_the_hash_of_the_contents_in_any_order() {
+        let hash_of = |order: &[u32]| {
+            with_mirror(|mirror| {
+                for &index in order {
+                    mirror.set_cell(index, cell(index * 7)).unwrap();
+                    mirror.set_cell(index, cell(index)).unwrap();
+                    let entries = [index, 1, 0, 0, 0, 0, 0, 0];
+                    mirror.set_bucket(index % 70, Bucket { entries }).unwrap();
+                    assert_eq!(mirror.hash(), mirror.recompute_hash());
+                }
+                mirror.hash()
+            })
+        };
+        assert_eq!(hash_of(&[5, 60, 9]), hash_of(&[9, 5, 60]));
+        assert_ne!(hash_of(&[5, 60, 9]), hash_of(&[5, 60, 10]));
+    }
+
+    #[test]
+    fn only_real_changes_are_dirty_and_reset_marks_what_it_takes_away() {
+        with_mirror(|mirror| {
+            mirror.set_cell(7, cell(7)).unwrap();
+            mirror.set_cell(8, cell(8)).unwrap();
+            mirror.set_cell(100, Cell::default()).unwrap();
+            let runs = |mirror: &Mirror<Borrowed<'_>>| -> Vec<_> {
+                mirror.dirty_runs(Buffer::Cells).collect()
+            };
+            assert_eq!(runs(mirror), [7..9]);
+            mirror.clear_dirty();
+            mirror.set_cell(8, cell(8)).unwrap();
+            assert_eq!(runs(mirror), []);
+            mirror.reset();
+            assert_eq!(runs(mirror), [7..9]);
+            assert_eq!((mirror.hash(), mirror.recompute_hash()), (0, 0));
+        });
+    }
+
+    #[test]
+    fn changes_out_of_range_are_refused_and_change_nothing() {
+        with_mirror(|mirror| {
+            assert_eq!(mirror.set_cell(200, cell(1)), Err(MirrorError::Index));
+            assert_eq!(
+                mirror.set_bucket(70, Bucket::default()),
+                Err(MirrorError::Index)
+            );
+            let entries = [1, 200, 0, 0, 0, 0, 0, 0];
+            assert_eq!(
+                mirror.set_bucket(0, Bucket { entries }),
+                Err(MirrorError::Entry)
+            );
+            assert_eq!(
+                mirror.set_instance(3, Instance::default()),
+                Err(MirrorError::Index)
+            );
+            let bad = Instance {
+                bucket_count: 1,
+                ..Instance::default()
+            };
+            assert!(matches!(
+                mirror.set_instance(0, bad),
+                Err(MirrorError::Grid(_))
+            ));
+            assert_eq!(mirror.hash(), 0);
+        });
+    }
+}
