@@ -2,7 +2,10 @@
 
 use bytemuck::{Pod, Zeroable};
 
-/// An instance's grid and hash table, as the shaders read it: 80 bytes, five `vec4`.
+/// Most cells along an axis of a grid: a local coordinate in `f32` still tells 1/16 of a cell.
+pub const MAX_DIM: u32 = 1 << 20;
+
+/// An instance's grid and hash table, as the shaders read it: 64 bytes, four `vec4`.
 ///
 /// The grid lives in the instance's local space: its *cell units* are
 /// `g = (position − origin) · cells_per_unit`. `cells_per_unit` has a factor an axis, so that under
@@ -27,12 +30,8 @@ pub struct Instance {
     /// Factors that take a local normal to cell units (before normalising): 1 / `cells_per_unit`,
     /// scaled so that the largest is 1.
     pub normal_scale: [f32; 3],
-    /// 17·Dx mod `bucket_count`, from Eq. 1.
-    pub stride_y: u32,
-    /// 31·Dx·Dy mod `bucket_count`, from Eq. 1.
-    pub stride_z: u32,
     /// Zero.
-    pub reserved: [u32; 3],
+    pub reserved: u32,
 }
 
 /// Why an [`Instance`] cannot be used.
@@ -40,24 +39,15 @@ pub struct Instance {
 pub enum GridError {
     /// A field is not finite, or a radius or scale not above zero.
     NotFinite,
-    /// A dimension is 0, or the cells don't number below 2³², or a hash could pass 2³².
-    TooLarge,
-    /// A stride is not what Eq. 1 gives, or a reserved field is not 0.
-    Inconsistent,
+    /// A dimension is 0 or above [`MAX_DIM`].
+    Dims,
+    /// The reserved field is not 0.
+    Reserved,
     /// Its buckets lie outside the bucket buffer.
     OutOfRange,
 }
 
 impl Instance {
-    /// Sets the strides of Eq. 1 from `dims` and `bucket_count`.
-    pub fn set_strides(&mut self) {
-        let [dx, dy, _] = self.dims.map(u64::from);
-        let buckets = u64::from(self.bucket_count.max(1));
-        self.stride_y = (17 * dx % buckets) as u32;
-        // dx·dy is below 2³² for every valid grid, so 31 times it fits.
-        self.stride_z = (31 * (dx * dy % buckets) % buckets) as u32;
-    }
-
     /// Checks everything that reading with this instance relies on. `buckets`: the bucket
     /// buffer's length.
     pub fn validate(&self, buckets: u32) -> Result<(), GridError> {
@@ -75,23 +65,11 @@ impl Instance {
         {
             return Err(GridError::NotFinite);
         }
-        let [dx, dy, dz] = self.dims.map(u64::from);
-        let (max, empty) = (u64::from(u32::MAX), self.dims.contains(&0));
-        if empty || (dx * dy).saturating_mul(dz) > max {
-            return Err(GridError::TooLarge);
+        if self.dims.iter().any(|&dim| dim == 0 || dim > MAX_DIM) {
+            return Err(GridError::Dims);
         }
-        let hash_max = ((dy - 1) * u64::from(self.stride_y))
-            .saturating_add((dz - 1) * u64::from(self.stride_z))
-            .saturating_add(dx - 1);
-        if hash_max > max {
-            return Err(GridError::TooLarge);
-        }
-        let mut expected = *self;
-        expected.set_strides();
-        if (expected.stride_y, expected.stride_z) != (self.stride_y, self.stride_z)
-            || self.reserved != [0; 3]
-        {
-            return Err(GridError::Inconsistent);
+        if self.reserved != 0 {
+            return Err(GridError::Reserved);
         }
         match self.bucket_first.checked_add(self.bucket_count) {
             Some(end) if end <= buckets => Ok(()),
@@ -106,24 +84,27 @@ impl Instance {
         })
     }
 
-    /// The dense index of a cell inside the grid: what [`crate::Cell::key`] holds.
+    /// The dense index of a cell, x + y·Dx + z·Dx·Dy: what [`crate::Cell::key`] holds. In a grid
+    /// of more than 2³² cells it wraps; cells that share a bucket are far too few to meet again.
     pub fn key(&self, cell: [u32; 3]) -> u32 {
-        let [x, y, z] = cell;
-        x.wrapping_add(y.wrapping_mul(self.dims[0]))
-            .wrapping_add(z.wrapping_mul(self.dims[0].wrapping_mul(self.dims[1])))
+        self.weigh(cell, 1, 1)
     }
 
-    /// The bucket, in the bucket buffer, of a cell inside the grid.
+    /// The bucket, in the bucket buffer, of a cell.
     ///
-    /// Eq. 1: H(p) = px + py·Dx·17 + pz·Dx·Dy·31, modulo the instance's buckets; the strides are
-    /// reduced beforehand, so nothing overflows 32 bits. Call only on a validated instance.
+    /// Eq. 1: H(p) = px + py·Dx·17 + pz·Dx·Dy·31 in wrapping 32-bit arithmetic, modulo the
+    /// instance's buckets.
     pub fn bucket(&self, cell: [u32; 3]) -> u32 {
-        let [x, y, z] = cell;
-        let hash = x
-            .wrapping_add(y.wrapping_mul(self.stride_y))
-            .wrapping_add(z.wrapping_mul(self.stride_z));
+        let hash = self.weigh(cell, 17, 31);
         self.bucket_first
             .wrapping_add(hash % self.bucket_count.max(1))
+    }
+
+    fn weigh(&self, [x, y, z]: [u32; 3], weight_y: u32, weight_z: u32) -> u32 {
+        let row = self.dims[0];
+        let layer = row.wrapping_mul(self.dims[1]);
+        x.wrapping_add(y.wrapping_mul(row).wrapping_mul(weight_y))
+            .wrapping_add(z.wrapping_mul(layer).wrapping_mul(weight_z))
     }
 }
 
@@ -132,16 +113,14 @@ mod tests {
     use super::*;
 
     fn instance(dims: [u32; 3], bucket_count: u32) -> Instance {
-        let mut instance = Instance {
+        Instance {
             radius: 0.8,
             cells_per_unit: [20.0; 3],
             dims,
             bucket_count,
             normal_scale: [1.0; 3],
             ..Instance::default()
-        };
-        instance.set_strides();
-        instance
+        }
     }
 
     #[test]
@@ -149,15 +128,13 @@ mod tests {
         for (dims, buckets) in [([7, 5, 3], 11), ([700, 300, 400], 90_001), ([1, 1, 1], 1)] {
             let grid = instance(dims, buckets);
             grid.validate(buckets).unwrap();
-            let [dx, dy, _] = dims.map(u128::from);
-            for (x, y, z) in [
-                (0, 0, 0),
-                (dims[0] - 1, dims[1] - 1, dims[2] - 1),
-                (0, 0, dims[2] / 2),
-            ] {
-                let [px, py, pz] = [x, y, z].map(u128::from);
+            let [dx, dy, dz] = dims.map(u128::from);
+            for [px, py, pz] in [[0, 0, 0], [dx - 1, dy - 1, dz - 1], [0, 0, dz / 2]] {
                 let h = px + py * dx * 17 + pz * dx * dy * 31;
-                assert_eq!(u128::from(grid.bucket([x, y, z])), h % u128::from(buckets));
+                let wrapped = h % (1 << 32) % u128::from(buckets);
+                let cell = [px, py, pz].map(|v| v as u32);
+                assert_eq!(u128::from(grid.bucket(cell)), wrapped);
+                assert_eq!(u128::from(grid.key(cell)), px + py * dx + pz * dx * dy);
             }
         }
     }
@@ -165,62 +142,49 @@ mod tests {
     #[test]
     fn unusable_grids_are_refused() {
         let good = instance([8, 8, 8], 64);
+        let check = |grid: Instance| grid.validate(64);
         assert_eq!(good.validate(63), Err(GridError::OutOfRange));
         assert_eq!(
-            Instance {
+            check(Instance {
                 dims: [8, 0, 8],
                 ..good
-            }
-            .validate(64),
-            Err(GridError::TooLarge)
+            }),
+            Err(GridError::Dims)
         );
         assert_eq!(
-            Instance {
-                dims: [u32::MAX; 3],
+            check(Instance {
+                dims: [8, 8, u32::MAX],
                 ..good
-            }
-            .validate(64),
-            Err(GridError::TooLarge)
+            }),
+            Err(GridError::Dims)
         );
         assert_eq!(
-            Instance {
-                stride_y: 1,
+            check(Instance {
+                reserved: 1,
                 ..good
-            }
-            .validate(64),
-            Err(GridError::Inconsistent)
+            }),
+            Err(GridError::Reserved)
         );
         assert_eq!(
-            Instance {
-                reserved: [0, 1, 0],
-                ..good
-            }
-            .validate(64),
-            Err(GridError::Inconsistent)
-        );
-        assert_eq!(
-            Instance {
+            check(Instance {
                 radius: f32::NAN,
                 ..good
-            }
-            .validate(64),
+            }),
             Err(GridError::NotFinite)
         );
         assert_eq!(
-            Instance {
+            check(Instance {
                 bucket_first: u32::MAX,
                 ..good
-            }
-            .validate(u32::MAX),
+            }),
             Err(GridError::OutOfRange)
         );
         assert_eq!(
-            Instance {
+            check(Instance {
                 bucket_count: 0,
                 radius: f32::NAN,
                 ..good
-            }
-            .validate(0),
+            }),
             Ok(())
         );
     }

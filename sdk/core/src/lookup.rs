@@ -245,7 +245,7 @@ mod tests {
 
     /// One instance of 4×4×4 cells of unit size, one cell filled.
     fn scene(cell: [u32; 3], points: &[Point]) -> (Instance, [Bucket; 16], [Cell; 2]) {
-        let mut grid = Instance {
+        let grid = Instance {
             radius: 0.8,
             cells_per_unit: [1.0; 3],
             dims: [4; 3],
@@ -253,7 +253,6 @@ mod tests {
             normal_scale: [1.0; 3],
             ..Instance::default()
         };
-        grid.set_strides();
         let mut buckets = [Bucket::default(); 16];
         buckets[grid.bucket(cell) as usize].entries[0] = 1;
         let mut cells = [Cell::default(); 2];

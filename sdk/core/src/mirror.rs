@@ -38,7 +38,7 @@ impl Capacity {
 /// One of the mirror's buffers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Buffer {
-    /// [`Instance`]s, 80 bytes each.
+    /// [`Instance`]s, 64 bytes each.
     Instances,
     /// [`Bucket`]s, 32 bytes each.
     Buckets,
