@@ -1,0 +1,914 @@
+//! The world: a scene with points on it, their occlusion traced, kept in buckets and cells.
+//!
+//! One [`World::step`] is the server's half of the frame up to selection:
+//! `scene ─► points ─► occlusion ─► truth`. Nothing is traced that cannot have changed: rays
+//! against geometry that a point is rigidly attached to are traced once and kept as bits; the
+//! others again only when something moved within their reach.
+
+use crate::points::{PointError, SurfacePoint, generate, largest_radius, morton_order};
+use crate::rays::{Against, CpuTracer, Deformed, TooManyTriangles, Tracer, offset_origin, reach};
+use crate::samples::Samples;
+use crate::scene::{InstancePose, Mesh, Pose, Scene};
+use crate::truth::{Place, Placement, Truth, buckets_for, fit};
+use glam::{Affine3A, DAffine3, Mat3A, Vec3, Vec3A};
+use psao_core::{Instance, Kernel};
+use rayon::prelude::*;
+use std::collections::{BTreeMap, HashSet};
+use std::ops::Range;
+
+/// Points of a slice: the unit of visibility and of tracing.
+pub const SLICE_POINTS: usize = 1024;
+
+/// Rays of the first pass over a slice, before it converges to [`Options::rays`].
+pub const FIRST_RAYS: usize = 64;
+
+/// How points are placed and traced.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Options {
+    /// Points per square metre and side.
+    pub density: f64,
+    /// Longest ray, metres.
+    pub ao_distance_m: f32,
+    /// Rays a point, 1 to 4096.
+    pub rays: usize,
+    /// Kernel that the grid is laid out for.
+    pub kernel: Kernel,
+    /// Interpolation radius r over the largest Poisson radius rm.
+    pub radius_over_rm: f32,
+    /// Cell size c over r.
+    pub cell_over_radius: f32,
+    /// Seed of the point placement.
+    pub seed: u64,
+}
+
+impl Options {
+    /// The defaults of a kernel. `Paper`: r is the spacing that elimination reaches, 1.41 rm, and
+    /// 2×2×2 cells cover the whole radius (c = 2r). `Planar`: r = 2 rm and c = 1.25 r, where
+    /// 2×2×2 cells hold everything nearer than 0.625 r, and fewer points are read.
+    pub fn of(kernel: Kernel) -> Options {
+        let (radius_over_rm, cell_over_radius) = match kernel {
+            Kernel::Paper => (1.41, 2.0),
+            Kernel::Planar => (2.0, 1.25),
+        };
+        Options {
+            density: 512.0,
+            ao_distance_m: 0.6,
+            rays: 256,
+            kernel,
+            radius_over_rm,
+            cell_over_radius,
+            seed: 1,
+        }
+    }
+
+    /// Interpolation radius, metres.
+    pub fn radius_m(&self) -> f32 {
+        largest_radius(self.density) as f32 * self.radius_over_rm
+    }
+
+    /// Cell size, metres.
+    pub fn cell_m(&self) -> f32 {
+        self.radius_m() * self.cell_over_radius
+    }
+}
+
+/// Why a world could not be made.
+#[derive(Debug)]
+pub enum WorldError {
+    /// Points could not be placed.
+    Points(PointError),
+    /// The scene is too large to trace.
+    Triangles(TooManyTriangles),
+    /// The scene has too many points for 32-bit numbers (how many).
+    TooManyPoints(u64),
+}
+
+impl std::fmt::Display for WorldError {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            WorldError::Points(error) => write!(f, "{error}"),
+            WorldError::Triangles(error) => write!(f, "{error}"),
+            WorldError::TooManyPoints(count) => write!(
+                f,
+                "the scene would get {count} points, more than {MAX_POINTS}: lower --density, or \
+                 give --unit if the scene is not in metres"
+            ),
+        }
+    }
+}
+
+impl std::error::Error for WorldError {}
+
+impl From<PointError> for WorldError {
+    fn from(error: PointError) -> WorldError {
+        WorldError::Points(error)
+    }
+}
+
+/// Most points of a scene: about 90 bytes each.
+pub const MAX_POINTS: u64 = 1 << 26;
+
+/// A run of points of one instance in Morton order.
+#[derive(Clone, Debug)]
+pub struct Slice {
+    /// Instance index.
+    pub instance: u32,
+    /// Numbers of its points.
+    pub points: Range<u32>,
+    /// Cells that its points opened; empty for deforming instances, whose cells come and go.
+    pub cells: Range<u32>,
+    /// World bounds now, with a cell's margin.
+    pub bounds: [Vec3; 2],
+    /// Bounds in local space, for rigid instances.
+    local_bounds: [Vec3; 2],
+    /// Rays whose fixed bits are known.
+    rays_done: usize,
+    /// Something within reach has moved since its points were traced.
+    stale: bool,
+}
+
+/// An instance that carries points.
+#[derive(Clone, Debug)]
+struct Carrier {
+    points: Range<u32>,
+    slices: Range<u32>,
+    local_extent: Vec3,
+    deforms: bool,
+    /// Points have not been moved to the present pose.
+    unplaced: bool,
+}
+
+/// What one step did.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct StepStats {
+    /// Rays traced.
+    pub rays: u64,
+    /// Rays if every visible point had been traced with all its rays, as in the paper.
+    pub rays_if_all: u64,
+    /// Points traced.
+    pub points: u64,
+    /// Visible slices that have not reached all their rays.
+    pub converging: u64,
+}
+
+/// A progress report: stage, done, total.
+pub type Progress<'a> = &'a (dyn Fn(&str, u64, u64) + Sync);
+
+/// The scene, its points, and what they say.
+pub struct World {
+    /// The scene.
+    pub scene: Scene,
+    /// How it is sampled.
+    pub options: Options,
+    /// Where everything is.
+    pub pose: Pose,
+    /// Buckets and cells.
+    pub truth: Truth,
+    /// All slices, instance by instance.
+    pub slices: Vec<Slice>,
+    /// For each cell of a rigid instance its slice; 0 where none.
+    pub slice_of_cell: Vec<u32>,
+    /// Cells from here on belong to deforming instances, in no order.
+    pub loose_cells: u32,
+    /// Vertices of deforming instances.
+    pub deformed: Vec<Deformed>,
+    tracer: CpuTracer,
+    samples: Samples,
+    carriers: Vec<Option<Carrier>>,
+    points: Vec<SurfacePoint>,
+    places: Vec<Place>,
+    occlusion: Vec<u8>,
+    /// Rays against what each point is attached to: bits of those that hit.
+    fixed: Vec<u64>,
+    moves: Vec<bool>,
+    /// World bounds of each instance that moves, now and at the step before.
+    swept: Vec<[[Vec3; 2]; 2]>,
+    driven: BTreeMap<u32, DAffine3>,
+    posed: BTreeMap<u32, Vec<Affine3A>>,
+    previous: Pose,
+}
+
+impl World {
+    /// Places points on a scene and sorts them into cells; nothing is traced yet.
+    ///
+    /// # Errors
+    /// The density asks for more points, or the scene has more triangles, than there is room for.
+    pub fn new(
+        scene: Scene,
+        options: Options,
+        progress: Progress<'_>,
+    ) -> Result<World, WorldError> {
+        let mut pose = Pose::default();
+        scene.pose(0.0, &mut pose);
+        let moves: Vec<bool> = scene.instances.iter().map(|i| i.moves || i.deforms).collect();
+        let mut deformed = Vec::new();
+        for (index, instance) in scene.instances.iter().enumerate() {
+            if instance.deforms {
+                deformed.push(Deformed { instance: index as u32, ..Deformed::default() });
+            }
+        }
+        deform(&scene, &pose, &mut deformed);
+        let tracer = CpuTracer::new(&scene, &pose, &deformed, &moves)
+            .map_err(WorldError::Triangles)?;
+        let placed = place_points(&scene, &pose, &deformed, &options, progress)?;
+
+        let mut world = World {
+            samples: Samples::new(options.rays),
+            truth: Truth::default(),
+            slices: Vec::new(),
+            slice_of_cell: Vec::new(),
+            loose_cells: 1,
+            tracer,
+            carriers: vec![None; scene.instances.len()],
+            points: Vec::new(),
+            places: Vec::new(),
+            occlusion: Vec::new(),
+            fixed: Vec::new(),
+            swept: vec![[[Vec3::ZERO; 2]; 2]; scene.instances.len()],
+            driven: BTreeMap::new(),
+            posed: BTreeMap::new(),
+            previous: pose.clone(),
+            moves,
+            scene,
+            options,
+            pose,
+            deformed,
+        };
+        world.build_cells(placed, progress);
+        world.sweep();
+        world.sweep();
+        Ok(world)
+    }
+
+    fn build_cells(&mut self, placed: Vec<Placed>, progress: Progress<'_>) {
+        let total: usize = placed.iter().map(|p| p.points.len()).sum();
+        let mut instances = vec![Instance::default(); self.scene.instances.len()];
+        let (mut buckets, mut cells) = (0, 0);
+        for placed in &placed {
+            let mut grid = placed.grid;
+            grid.bucket_first = buckets;
+            grid.bucket_count = buckets_for(placed.cells);
+            buckets += grid.bucket_count;
+            // What deforms opens new cells before the old ones are empty.
+            cells += if placed.deforms { placed.cells * 2 + 64 } else { placed.cells };
+            instances[placed.instance as usize] = grid;
+        }
+        self.truth = Truth::new(instances, cells);
+        self.slice_of_cell = vec![0; cells + 1];
+        self.points.reserve_exact(total);
+        self.places.reserve_exact(total);
+        // Rigid instances first: their cells never change and lie slice by slice.
+        let rigid = placed.iter().filter(|p| !p.deforms);
+        for placed in rigid.chain(placed.iter().filter(|p| p.deforms)) {
+            if placed.deforms && self.loose_cells == 1 {
+                self.loose_cells = self.truth.next_cell();
+            }
+            self.add_carrier(placed);
+            progress("cells", self.points.len() as u64, total as u64);
+        }
+        if !placed.iter().any(|p| p.deforms) {
+            self.loose_cells = self.truth.next_cell();
+        }
+        self.occlusion = vec![255; self.points.len()];
+        self.fixed = vec![0; self.points.len() * self.words()];
+        for slice in 0..self.slices.len() {
+            self.slices[slice].bounds = self.slice_bounds(slice);
+        }
+    }
+
+    fn add_carrier(&mut self, placed: &Placed) {
+        let first = self.points.len() as u32;
+        let first_slice = self.slices.len() as u32;
+        for (chunk, places) in
+            placed.points.chunks(SLICE_POINTS).zip(placed.placements.chunks(SLICE_POINTS))
+        {
+            let slice_first = self.points.len() as u32;
+            let cell_first = self.truth.next_cell();
+            for (point, at) in chunk.iter().zip(places) {
+                let number = self.points.len() as u32;
+                let place = match at {
+                    Some(at) => self.truth.insert(placed.instance, number, *at, 255),
+                    None => Place::NONE,
+                };
+                self.points.push(*point);
+                self.places.push(place);
+            }
+            let cells = cell_first..self.truth.next_cell();
+            let slice = self.slices.len() as u32;
+            self.slice_of_cell[cells.start as usize..cells.end as usize].fill(slice);
+            self.slices.push(Slice {
+                instance: placed.instance,
+                points: slice_first..self.points.len() as u32,
+                cells: if placed.deforms { 0..0 } else { cells },
+                bounds: [Vec3::ZERO; 2],
+                local_bounds: [Vec3::ZERO; 2],
+                rays_done: 0,
+                stale: true,
+            });
+        }
+        let mesh = self.mesh(placed.instance);
+        let extent = mesh.positions.iter().fold(Vec3::ZERO, |e, p| e.max(p.abs()));
+        self.carriers[placed.instance as usize] = Some(Carrier {
+            points: first..self.points.len() as u32,
+            slices: first_slice..self.slices.len() as u32,
+            local_extent: extent,
+            deforms: placed.deforms,
+            unplaced: false,
+        });
+        if !placed.deforms {
+            for slice in first_slice as usize..self.slices.len() {
+                let range = self.slices[slice].points.clone();
+                let positions = &self.mesh(placed.instance).positions;
+                self.slices[slice].local_bounds =
+                    bounds_of(self.local_positions(placed.instance, range, positions));
+            }
+        }
+    }
+
+    /// The engine (or a client) moves an instance from now on; world metres.
+    ///
+    /// # Errors
+    /// There is no such instance.
+    pub fn drive(&mut self, instance: u32, world_from_local: DAffine3) -> Result<(), NoInstance> {
+        let known = (instance as usize) < self.scene.instances.len();
+        known.then(|| self.driven.insert(instance, world_from_local)).ok_or(NoInstance(instance))?;
+        if !self.moves[instance as usize] {
+            self.promote(instance);
+        }
+        Ok(())
+    }
+
+    /// The engine (or a client) poses a skinned instance from now on: local from rest, a joint.
+    ///
+    /// # Errors
+    /// There is no such instance, or it has another number of joints.
+    pub fn drive_joints(
+        &mut self,
+        instance: u32,
+        joints: Vec<Affine3A>,
+    ) -> Result<(), NoInstance> {
+        let pose = self.pose.instances.get(instance as usize);
+        if !pose.is_some_and(|pose| pose.joints.len() == joints.len() && !joints.is_empty()) {
+            return Err(NoInstance(instance));
+        }
+        self.posed.insert(instance, joints);
+        Ok(())
+    }
+
+    /// An instance that stood still begins to move: the bits of its own points, and of all
+    /// within its reach, no longer hold.
+    fn promote(&mut self, instance: u32) {
+        self.moves[instance as usize] = true;
+        self.sweep();
+        let bounds = self.swept[instance as usize][0];
+        // It has no more triangles than before, so the tracer that fitted still fits.
+        if let Ok(tracer) = CpuTracer::new(&self.scene, &self.pose, &self.deformed, &self.moves) {
+            self.tracer = tracer;
+        }
+        let reach = self.options.ao_distance_m;
+        for slice in &mut self.slices {
+            if slice.instance == instance || touches(slice.bounds, bounds, reach) {
+                slice.rays_done = 0;
+                slice.stale = true;
+            }
+        }
+    }
+
+    /// Advances to a time and brings the points of all `visible` slices up to date.
+    ///
+    /// `visible` is asked with world bounds relative to the scene's origin. `converge_rays` bounds
+    /// the rays spent on slices that have not reached all their rays; 0 for none.
+    pub fn step(
+        &mut self,
+        time_s: f64,
+        visible: &(dyn Fn([Vec3; 2]) -> bool + Sync),
+        converge_rays: u64,
+    ) -> StepStats {
+        self.pose_at(time_s);
+        self.mark_stale();
+        self.place_deforming(visible);
+        self.trace(visible, converge_rays, &|_, _| ())
+    }
+
+    /// Traces all `visible` slices with all rays, in stages of rising numbers of rays.
+    pub fn converge(
+        &mut self,
+        visible: &(dyn Fn([Vec3; 2]) -> bool + Sync),
+        progress: Progress<'_>,
+    ) -> StepStats {
+        let mut total = StepStats::default();
+        loop {
+            let report = |done, all| progress("first occlusion", done, all);
+            let stats = self.trace(visible, u64::MAX, &report);
+            total.rays += stats.rays;
+            total.points += stats.points;
+            if stats.converging == 0 {
+                return total;
+            }
+        }
+    }
+
+    fn pose_at(&mut self, time_s: f64) {
+        std::mem::swap(&mut self.previous, &mut self.pose);
+        self.scene.pose(time_s, &mut self.pose);
+        for (&instance, world) in &self.driven {
+            let local = DAffine3 { translation: world.translation - self.scene.origin, ..*world };
+            self.pose.instances[instance as usize].world_from_local = single(local);
+        }
+        for (&instance, joints) in &self.posed {
+            self.pose.instances[instance as usize].joints.clone_from(joints);
+        }
+        deform(&self.scene, &self.pose, &mut self.deformed);
+        self.tracer.update(&self.scene, &self.pose, &self.deformed);
+        self.sweep();
+    }
+
+    /// Takes the movers' bounds of the present pose.
+    fn sweep(&mut self) {
+        for instance in (0..self.moves.len()).filter(|&i| self.moves[i]) {
+            let local = bounds_of(self.vertices(instance as u32).0.iter().copied());
+            let world = &self.pose.instances[instance].world_from_local;
+            let [before, now] = [self.swept[instance][0], placed_bounds(world, local)];
+            self.swept[instance] = [now, before];
+        }
+    }
+
+    /// Marks the slices within reach of what moved since the last step.
+    fn mark_stale(&mut self) {
+        let mut swept = Vec::new();
+        for instance in 0..self.scene.instances.len() {
+            let (old, new) = (&self.previous.instances[instance], &self.pose.instances[instance]);
+            let turned = old.world_from_local != new.world_from_local;
+            let bent = old.joints != new.joints || old.morph_weights != new.morph_weights;
+            if !(self.moves[instance] && (turned || bent)) {
+                continue;
+            }
+            let number = instance as u32;
+            let [after, before] = self.swept[instance];
+            swept.push((number, [before[0].min(after[0]), before[1].max(after[1])]));
+            if let Some(carrier) = &mut self.carriers[instance] {
+                carrier.unplaced |= carrier.deforms;
+                for slice in carrier.slices.clone() {
+                    self.slices[slice as usize].stale = true;
+                    self.slices[slice as usize].bounds = self.slice_bounds(slice as usize);
+                }
+            }
+        }
+        let reach = self.options.ao_distance_m;
+        for slice in &mut self.slices {
+            slice.stale |= swept.iter().any(|(instance, bounds)| {
+                *instance != slice.instance && touches(slice.bounds, *bounds, reach)
+            });
+        }
+    }
+
+    /// Moves the points of visible deforming instances to their cells in the present pose.
+    fn place_deforming(&mut self, visible: &(dyn Fn([Vec3; 2]) -> bool + Sync)) {
+        for instance in 0..self.carriers.len() {
+            let Some(carrier) = &self.carriers[instance] else { continue };
+            let seen = |slice: u32| visible(self.slices[slice as usize].bounds);
+            if !carrier.unplaced || !carrier.slices.clone().any(seen) {
+                continue;
+            }
+            let points = carrier.points.clone();
+            let mut placements = self.placements(instance as u32, points.clone());
+            if placements.iter().any(Option::is_none) {
+                self.regrid(instance as u32, points.clone());
+                placements = self.placements(instance as u32, points.clone());
+            }
+            for (point, at) in points.zip(placements) {
+                self.move_point(instance as u32, point, at);
+            }
+            if let Some(carrier) = &mut self.carriers[instance] {
+                carrier.unplaced = false;
+            }
+        }
+    }
+
+    fn move_point(&mut self, instance: u32, point: u32, at: Option<Placement>) {
+        let (place, occlusion) = (self.places[point as usize], self.occlusion[point as usize]);
+        if let Some(at) = at
+            && self.truth.is_in_cell(place, instance, at)
+        {
+            self.truth.set_point(place, at, occlusion);
+            return;
+        }
+        if let Some((moved, to)) = self.truth.remove(place) {
+            self.places[moved as usize] = to;
+        }
+        self.places[point as usize] = match at {
+            Some(at) => self.truth.insert(instance, point, at, occlusion),
+            None => Place::NONE,
+        };
+    }
+
+    /// A deforming instance has left its grid: a larger one.
+    fn regrid(&mut self, instance: u32, points: Range<u32>) {
+        let positions = &self.vertices(instance).0;
+        let [min, max] = bounds_of(self.local_positions(instance, points.clone(), positions));
+        let margin = (max - min) * 0.25;
+        let scale = scale_of(&self.pose.instances[instance as usize].world_from_local);
+        let (cell_m, radius) = (self.options.cell_m(), 1.0 / self.options.cell_over_radius);
+        // A pose that no grid fits (not finite, or flattened) leaves its points discarded.
+        if let Some(grid) = fit([min - margin, max + margin], scale, cell_m, radius) {
+            self.truth.regrid(instance, grid);
+            self.places[points.start as usize..points.end as usize].fill(Place::NONE);
+        }
+    }
+
+    fn placements(&self, instance: u32, points: Range<u32>) -> Vec<Option<Placement>> {
+        let grid = &self.truth.instances[instance as usize];
+        let triangles = &self.mesh(instance).triangles;
+        let (positions, normals) = self.vertices(instance);
+        self.points[points.start as usize..points.end as usize]
+            .par_iter()
+            .map(|p| {
+                let position = p.position(triangles, positions);
+                Placement::of(grid, position, p.normal(triangles, positions, normals))
+            })
+            .collect()
+    }
+
+    /// Traces what is visible and due. Slices that have not converged gain rays within the budget.
+    fn trace(
+        &mut self,
+        visible: &(dyn Fn([Vec3; 2]) -> bool + Sync),
+        converge_rays: u64,
+        report: &(dyn Fn(u64, u64) + Sync),
+    ) -> StepStats {
+        let all = self.options.rays;
+        let mut stats = StepStats::default();
+        let mut due: Vec<(usize, usize)> = Vec::new();
+        let mut budget = converge_rays;
+        for (index, slice) in self.slices.iter().enumerate() {
+            if !visible(slice.bounds) {
+                continue;
+            }
+            let points = slice.points.len() as u64;
+            stats.rays_if_all += points * all as u64;
+            let mut rays = slice.rays_done;
+            if rays < all {
+                // Deforming points keep no bits, so they start with all rays.
+                let deforms = self.carriers[slice.instance as usize]
+                    .as_ref()
+                    .is_some_and(|carrier| carrier.deforms);
+                let next = if deforms { all } else { (rays * 2).max(FIRST_RAYS).min(all) };
+                let cost = (next - rays) as u64 * points;
+                if cost <= budget {
+                    budget -= cost;
+                    rays = next;
+                }
+                stats.converging += u64::from(rays < all);
+            }
+            if rays > slice.rays_done || slice.stale && rays > 0 {
+                due.push((index, rays));
+            }
+        }
+        let done = std::sync::atomic::AtomicU64::new(0);
+        let total: u64 = due.iter().map(|&(slice, _)| self.slices[slice].points.len() as u64).sum();
+        let traced: Vec<Traced> = due
+            .par_iter()
+            .map(|&(slice, rays)| {
+                let traced = self.trace_slice(slice, rays);
+                let points = self.slices[slice].points.len() as u64;
+                let so_far = done.fetch_add(points, std::sync::atomic::Ordering::Relaxed);
+                report(so_far + points, total);
+                traced
+            })
+            .collect();
+        for (&(index, rays), traced) in due.iter().zip(&traced) {
+            let slice = &mut self.slices[index];
+            slice.rays_done = rays;
+            slice.stale = false;
+            let (first, words) = (slice.points.start as usize, all.div_ceil(64));
+            stats.rays += traced.rays;
+            stats.points += traced.occlusion.len() as u64;
+            let bits = first * words..first * words + traced.fixed.len();
+            self.fixed[bits].copy_from_slice(&traced.fixed);
+            for (point, &occlusion) in (first..).zip(&traced.occlusion) {
+                if self.occlusion[point] != occlusion {
+                    self.occlusion[point] = occlusion;
+                    self.truth.set_occlusion(self.places[point], occlusion);
+                }
+            }
+        }
+        stats
+    }
+
+    fn trace_slice(&self, index: usize, rays: usize) -> Traced {
+        let slice = &self.slices[index];
+        let instance = slice.instance;
+        let carrier = self.carriers[instance as usize].as_ref();
+        let (deforms, extent) =
+            carrier.map_or((false, Vec3::ZERO), |c| (c.deforms, c.local_extent));
+        let (attached, others) = match (deforms, self.moves[instance as usize]) {
+            (true, _) => (None, Against::All),
+            (false, true) => (Some(Against::Instance(instance)), Against::AllExcept(instance)),
+            (false, false) => (Some(Against::Static), Against::Movers),
+        };
+        let triangles = &self.mesh(instance).triangles;
+        let (positions, normals) = self.vertices(instance);
+        let world = self.pose.instances[instance as usize].world_from_local;
+        let (to_normal, reach) = (normal_matrix(&world), reach(&world, extent));
+        let t_max = self.options.ao_distance_m;
+        let movers = self.movers_near(slice.bounds);
+        let words = self.words();
+        let mut traced = Traced::default();
+        let mut directions = vec![Vec3::ZERO; rays];
+        let mut todo = vec![0u64; words];
+        let mut hit = vec![0u64; words];
+        for number in slice.points.clone() {
+            let point = &self.points[number as usize];
+            let position = world.transform_point3(point.position(triangles, positions));
+            let turn = |n: Vec3| Vec3::from(to_normal * Vec3A::from(n)).normalize_or(Vec3::Y);
+            let normal = turn(point.normal(triangles, positions, normals));
+            let outward = turn(point.geometric_normal(triangles, positions));
+            let tangent = world.transform_vector3(point.tangent(triangles, positions));
+            let origin = offset_origin(position, outward, reach);
+            self.samples.directions(number, normal, tangent, &mut directions);
+
+            hit.fill(0);
+            if let Some(attached) = attached {
+                let bits = number as usize * words;
+                hit.copy_from_slice(&self.fixed[bits..bits + words]);
+                if rays > slice.rays_done {
+                    set_bits(&mut todo, slice.rays_done..rays);
+                    self.tracer.occluded(attached, origin, &directions, t_max, &todo, &mut hit);
+                    traced.rays += (rays - slice.rays_done) as u64;
+                }
+                traced.fixed.extend_from_slice(&hit);
+            }
+            set_bits(&mut todo, 0..rays);
+            // A ray that hit what the point is attached to needs no other, and without a mover
+            // within reach none is needed.
+            let open = rays as u64 - count(&hit);
+            let reached = |mover: &[Vec3; 2]| touches(*mover, [origin; 2], t_max);
+            if others != Against::Movers || movers.iter().any(reached) {
+                self.tracer.occluded(others, origin, &directions, t_max, &todo, &mut hit);
+                traced.rays += open;
+            }
+            let blocked = count(&hit);
+            let open = 255.0 * (1.0 - blocked as f32 / rays as f32);
+            traced.occlusion.push((open + 0.5) as u8);
+        }
+        traced
+    }
+
+    /// Bounds of the movers that can be within reach of a slice's points.
+    fn movers_near(&self, bounds: [Vec3; 2]) -> Vec<[Vec3; 2]> {
+        let near = |now: &[Vec3; 2]| touches(bounds, *now, self.options.ao_distance_m);
+        let movers = (0..self.moves.len()).filter(|&instance| self.moves[instance]);
+        movers.map(|instance| self.swept[instance][0]).filter(near).collect()
+    }
+
+    fn mesh(&self, instance: u32) -> &Mesh {
+        &self.scene.meshes[self.scene.instances[instance as usize].mesh as usize]
+    }
+
+    /// Present local positions and normals of an instance's vertices.
+    pub fn vertices(&self, instance: u32) -> (&[Vec3], &[Vec3]) {
+        match self.deformed.binary_search_by_key(&instance, |d| d.instance) {
+            Ok(index) => (&self.deformed[index].positions, &self.deformed[index].normals),
+            Err(_) => (&self.mesh(instance).positions, &self.mesh(instance).normals),
+        }
+    }
+
+    /// The tracer, for pictures.
+    pub fn tracer(&self) -> &dyn Tracer {
+        &self.tracer
+    }
+
+    /// Points, discarded ones included.
+    pub fn point_count(&self) -> usize {
+        self.points.len()
+    }
+
+    /// Points that found no room in their cell or bucket.
+    pub fn discarded(&self) -> usize {
+        self.places.iter().filter(|&&place| place == Place::NONE).count()
+    }
+
+    fn words(&self) -> usize {
+        self.options.rays.div_ceil(64)
+    }
+
+    fn local_positions(
+        &self,
+        instance: u32,
+        points: Range<u32>,
+        positions: &[Vec3],
+    ) -> impl Iterator<Item = Vec3> {
+        let triangles = &self.mesh(instance).triangles;
+        self.points[points.start as usize..points.end as usize]
+            .iter()
+            .map(move |p| p.position(triangles, positions))
+    }
+
+    fn slice_bounds(&self, slice: usize) -> [Vec3; 2] {
+        let Slice { instance, points, local_bounds, .. } = &self.slices[slice];
+        let deforms = self.carriers[*instance as usize].as_ref().is_some_and(|c| c.deforms);
+        let local = if deforms {
+            let positions = self.vertices(*instance).0;
+            bounds_of(self.local_positions(*instance, points.clone(), positions))
+        } else {
+            *local_bounds
+        };
+        let world = &self.pose.instances[*instance as usize].world_from_local;
+        let [min, max] = placed_bounds(world, local);
+        let margin = self.options.cell_m();
+        [min - margin, max + margin]
+    }
+}
+
+/// There is no such instance, or it has no such joints.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct NoInstance(pub u32);
+
+impl std::fmt::Display for NoInstance {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "the scene has no instance {} with these joints", self.0)
+    }
+}
+
+impl std::error::Error for NoInstance {}
+
+#[derive(Default)]
+struct Traced {
+    occlusion: Vec<u8>,
+    fixed: Vec<u64>,
+    rays: u64,
+}
+
+fn set_bits(words: &mut [u64], bits: Range<usize>) {
+    words.fill(0);
+    for bit in bits {
+        words[bit / 64] |= 1 << (bit % 64);
+    }
+}
+
+fn count(words: &[u64]) -> u64 {
+    words.iter().map(|word| u64::from(word.count_ones())).sum()
+}
+
+fn deform(scene: &Scene, pose: &Pose, deformed: &mut [Deformed]) {
+    deformed.par_iter_mut().for_each(|d| {
+        let pose: &InstancePose = &pose.instances[d.instance as usize];
+        scene.deform(d.instance as usize, pose, &mut d.positions, &mut d.normals);
+    });
+}
+
+fn single(matrix: DAffine3) -> Affine3A {
+    Affine3A::from_mat3_translation(matrix.matrix3.as_mat3(), matrix.translation.as_vec3())
+}
+
+/// Local normals to world, before normalising; keeps "outward" under mirrored placements.
+pub fn normal_matrix(world_from_local: &Affine3A) -> Mat3A {
+    // The adjugate's transpose is the inverse's up to the determinant, and exists for flat ones.
+    let m = world_from_local.matrix3;
+    let cofactors = Mat3A::from_cols(
+        m.y_axis.cross(m.z_axis),
+        m.z_axis.cross(m.x_axis),
+        m.x_axis.cross(m.y_axis),
+    );
+    if m.determinant() < 0.0 { -cofactors } else { cofactors }
+}
+
+/// Metres a local unit along each axis.
+pub fn scale_of(world_from_local: &Affine3A) -> Vec3 {
+    let m = world_from_local.matrix3;
+    Vec3::new(m.x_axis.length(), m.y_axis.length(), m.z_axis.length())
+}
+
+fn bounds_of(positions: impl Iterator<Item = Vec3>) -> [Vec3; 2] {
+    positions.fold([Vec3::INFINITY, Vec3::NEG_INFINITY], |[min, max], p| [min.min(p), max.max(p)])
+}
+
+fn placed_bounds(world_from_local: &Affine3A, [min, max]: [Vec3; 2]) -> [Vec3; 2] {
+    let center = world_from_local.transform_point3((min + max) * 0.5);
+    let (half, m) = (Vec3A::from((max - min) * 0.5), world_from_local.matrix3);
+    let half = m.x_axis.abs() * half.x + m.y_axis.abs() * half.y + m.z_axis.abs() * half.z;
+    [center - Vec3::from(half), center + Vec3::from(half)]
+}
+
+/// Two boxes are nearer than `reach`.
+fn touches(a: [Vec3; 2], b: [Vec3; 2], reach: f32) -> bool {
+    (a[0] - reach).cmple(b[1]).all() && (b[0] - reach).cmple(a[1]).all()
+}
+
+/// An instance's points, before they are in cells.
+struct Placed {
+    instance: u32,
+    deforms: bool,
+    points: Vec<SurfacePoint>,
+    placements: Vec<Option<Placement>>,
+    grid: Instance,
+    /// Distinct cells of the placements.
+    cells: usize,
+}
+
+/// Paper, 3.1 and 3.2: points a mesh, then each instance's own prefix of them in Morton order.
+fn place_points(
+    scene: &Scene,
+    pose: &Pose,
+    deformed: &[Deformed],
+    options: &Options,
+    progress: Progress<'_>,
+) -> Result<Vec<Placed>, WorldError> {
+    // Instances share points if their mesh is the same and scaled by the same ratios.
+    let mut sets: BTreeMap<(u32, [i32; 2]), Vec<(u32, Vec3)>> = BTreeMap::new();
+    for (index, instance) in scene.instances.iter().enumerate() {
+        let mut scale = scale_of(&pose.instances[index].world_from_local);
+        if instance.deforms {
+            let mesh = &scene.meshes[instance.mesh as usize];
+            if let Some(d) = deformed.iter().find(|d| d.instance as usize == index) {
+                let posed = area(&mesh.triangles, &d.positions, scale);
+                scale = Vec3::splat((posed / area(&mesh.triangles, &mesh.positions, Vec3::ONE)).sqrt() as f32);
+            }
+        }
+        if !(scale.is_finite() && scale.min_element() > 0.0) {
+            continue;
+        }
+        let percent = |ratio: f32| ((ratio.ln() * 100.0).round()) as i32;
+        let ratios = [percent(scale.y / scale.x), percent(scale.z / scale.x)];
+        sets.entry((instance.mesh, ratios)).or_default().push((index as u32, scale));
+    }
+    let done = std::sync::atomic::AtomicU64::new(0);
+    let total = sets.len() as u64;
+    // Large meshes first, so that none is left for the end alone.
+    let mut sets: Vec<_> = sets.into_iter().collect();
+    sets.sort_by_key(|((mesh, _), _)| {
+        std::cmp::Reverse(scene.meshes[*mesh as usize].triangles.len())
+    });
+    let placed: Vec<Vec<Placed>> = sets
+        .par_iter()
+        .map(|((mesh_index, _), users)| {
+            let mesh = &scene.meshes[*mesh_index as usize];
+            let volume = |s: &Vec3| s.x * s.y * s.z;
+            let largest = users.iter().map(|(_, s)| *s).fold(Vec3::ZERO, |a, b| {
+                if volume(&b) > volume(&a) { b } else { a }
+            });
+            let set = generate(mesh, largest, options.density, options.seed + u64::from(*mesh_index))?;
+            let placed = users
+                .par_iter()
+                .filter_map(|&(instance, scale)| {
+                    let share = (scale / largest).powf(2.0).element_sum() / 3.0;
+                    let count = (set.points.len() as f32 * share).round() as usize;
+                    let points = &set.points[..count.clamp(1, set.points.len().max(1)).min(set.points.len())];
+                    let local_scale = scale_of(&pose.instances[instance as usize].world_from_local);
+                    place_instance(scene, deformed, options, instance, local_scale, points)
+                })
+                .collect();
+            progress("points", done.fetch_add(1, std::sync::atomic::Ordering::Relaxed) + 1, total);
+            Ok(placed)
+        })
+        .collect::<Result<_, PointError>>()?;
+    let mut placed: Vec<Placed> = placed.into_iter().flatten().collect();
+    placed.sort_by_key(|p| p.instance);
+    let count = placed.iter().map(|p| p.points.len() as u64).sum();
+    if count > MAX_POINTS {
+        return Err(WorldError::TooManyPoints(count));
+    }
+    Ok(placed)
+}
+
+/// One instance's points in Morton order, quantised in its own grid.
+fn place_instance(
+    scene: &Scene,
+    deformed: &[Deformed],
+    options: &Options,
+    instance: u32,
+    scale: Vec3,
+    points: &[SurfacePoint],
+) -> Option<Placed> {
+    let deforms = scene.instances[instance as usize].deforms;
+    let mesh = &scene.meshes[scene.instances[instance as usize].mesh as usize];
+    let (positions, normals) = match deformed.iter().find(|d| d.instance == instance) {
+        Some(d) => (&d.positions, &d.normals),
+        None => (&mesh.positions, &mesh.normals),
+    };
+    let local: Vec<Vec3> = points.iter().map(|p| p.position(&mesh.triangles, positions)).collect();
+    let bounds = bounds_of(local.iter().copied());
+    // Room to move in before the first new grid.
+    let margin = if deforms { (bounds[1] - bounds[0]) * 0.25 } else { Vec3::ZERO };
+    let bounds = [bounds[0] - margin, bounds[1] + margin];
+    let grid = fit(bounds, scale, options.cell_m(), 1.0 / options.cell_over_radius)?;
+    let points: Vec<SurfacePoint> =
+        morton_order(&local, bounds).into_iter().map(|i| points[i as usize]).collect();
+    let placements: Vec<Option<Placement>> = points
+        .iter()
+        .map(|p| {
+            let position = p.position(&mesh.triangles, positions);
+            Placement::of(&grid, position, p.normal(&mesh.triangles, positions, normals))
+        })
+        .collect();
+    let cells = placements.iter().flatten().map(|at| at.cell).collect::<HashSet<_>>().len();
+    Some(Placed { instance, deforms, points, placements, grid, cells })
+}
+
+fn area(triangles: &[[u32; 3]], positions: &[Vec3], scale: Vec3) -> f64 {
+    let double = triangles.iter().map(|t| {
+        let [a, b, c] = t.map(|i| (positions[i as usize] * scale).as_dvec3());
+        (b - a).cross(c - a).length()
+    });
+    double.sum::<f64>() * 0.5
+}
