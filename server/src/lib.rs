@@ -1,4 +1,6 @@
 //! The PSAO reference server: `scene ─► points ─► occlusion ─► select ─► encode ─► transport`.
 
+pub mod rays;
+pub mod samples;
 pub mod scene;
 pub mod truth;
