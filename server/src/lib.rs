@@ -1,9 +1,14 @@
 //! The PSAO reference server: `scene ─► points ─► occlusion ─► select ─► encode ─► transport`.
 
+pub mod camera;
+pub mod encode;
 pub mod metrics;
 pub mod picture;
+pub mod points;
 pub mod rays;
+pub mod render;
 pub mod report;
 pub mod samples;
 pub mod scene;
 pub mod truth;
+pub mod world;

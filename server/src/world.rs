@@ -10,7 +10,7 @@ use crate::rays::{Against, CpuTracer, Deformed, TooManyTriangles, Tracer, offset
 use crate::samples::Samples;
 use crate::scene::{InstancePose, Mesh, Pose, Scene};
 use crate::truth::{Place, Placement, Truth, buckets_for, fit};
-use glam::{Affine3A, DAffine3, Mat3A, Vec3, Vec3A};
+use glam::{Affine3A, DAffine3, Vec3, Vec3A};
 use psao_core::{Instance, Kernel};
 use rayon::prelude::*;
 use std::collections::{BTreeMap, HashSet};
@@ -132,7 +132,6 @@ pub struct Slice {
 struct Carrier {
     points: Range<u32>,
     slices: Range<u32>,
-    local_extent: Vec3,
     deforms: bool,
     /// Points have not been moved to the present pose.
     unplaced: bool,
@@ -166,12 +165,13 @@ pub struct World {
     pub truth: Truth,
     /// All slices, instance by instance.
     pub slices: Vec<Slice>,
-    /// For each cell of a rigid instance its slice; 0 where none.
-    pub slice_of_cell: Vec<u32>,
     /// Cells from here on belong to deforming instances, in no order.
     pub loose_cells: u32,
     /// Vertices of deforming instances.
     pub deformed: Vec<Deformed>,
+    instance_of_bucket: Vec<u32>,
+    /// Largest local coordinates of each mesh.
+    extents: Vec<Vec3>,
     tracer: CpuTracer,
     samples: Samples,
     carriers: Vec<Option<Carrier>>,
@@ -200,23 +200,31 @@ impl World {
     ) -> Result<World, WorldError> {
         let mut pose = Pose::default();
         scene.pose(0.0, &mut pose);
-        let moves: Vec<bool> = scene.instances.iter().map(|i| i.moves || i.deforms).collect();
+        let moves: Vec<bool> = scene
+            .instances
+            .iter()
+            .map(|i| i.moves || i.deforms)
+            .collect();
         let mut deformed = Vec::new();
         for (index, instance) in scene.instances.iter().enumerate() {
             if instance.deforms {
-                deformed.push(Deformed { instance: index as u32, ..Deformed::default() });
+                deformed.push(Deformed {
+                    instance: index as u32,
+                    ..Deformed::default()
+                });
             }
         }
         deform(&scene, &pose, &mut deformed);
-        let tracer = CpuTracer::new(&scene, &pose, &deformed, &moves)
-            .map_err(WorldError::Triangles)?;
+        let tracer =
+            CpuTracer::new(&scene, &pose, &deformed, &moves).map_err(WorldError::Triangles)?;
         let placed = place_points(&scene, &pose, &deformed, &options, progress)?;
 
         let mut world = World {
             samples: Samples::new(options.rays),
             truth: Truth::default(),
             slices: Vec::new(),
-            slice_of_cell: Vec::new(),
+            instance_of_bucket: Vec::new(),
+            extents: scene.meshes.iter().map(extent).collect(),
             loose_cells: 1,
             tracer,
             carriers: vec![None; scene.instances.len()],
@@ -249,12 +257,17 @@ impl World {
             grid.bucket_first = buckets;
             grid.bucket_count = buckets_for(placed.cells);
             buckets += grid.bucket_count;
+            self.instance_of_bucket
+                .resize(buckets as usize, placed.instance);
             // What deforms opens new cells before the old ones are empty.
-            cells += if placed.deforms { placed.cells * 2 + 64 } else { placed.cells };
+            cells += if placed.deforms {
+                placed.cells * 2 + 64
+            } else {
+                placed.cells
+            };
             instances[placed.instance as usize] = grid;
         }
         self.truth = Truth::new(instances, cells);
-        self.slice_of_cell = vec![0; cells + 1];
         self.points.reserve_exact(total);
         self.places.reserve_exact(total);
         // Rigid instances first: their cells never change and lie slice by slice.
@@ -279,8 +292,10 @@ impl World {
     fn add_carrier(&mut self, placed: &Placed) {
         let first = self.points.len() as u32;
         let first_slice = self.slices.len() as u32;
-        for (chunk, places) in
-            placed.points.chunks(SLICE_POINTS).zip(placed.placements.chunks(SLICE_POINTS))
+        for (chunk, places) in placed
+            .points
+            .chunks(SLICE_POINTS)
+            .zip(placed.placements.chunks(SLICE_POINTS))
         {
             let slice_first = self.points.len() as u32;
             let cell_first = self.truth.next_cell();
@@ -294,8 +309,6 @@ impl World {
                 self.places.push(place);
             }
             let cells = cell_first..self.truth.next_cell();
-            let slice = self.slices.len() as u32;
-            self.slice_of_cell[cells.start as usize..cells.end as usize].fill(slice);
             self.slices.push(Slice {
                 instance: placed.instance,
                 points: slice_first..self.points.len() as u32,
@@ -306,12 +319,9 @@ impl World {
                 stale: true,
             });
         }
-        let mesh = self.mesh(placed.instance);
-        let extent = mesh.positions.iter().fold(Vec3::ZERO, |e, p| e.max(p.abs()));
         self.carriers[placed.instance as usize] = Some(Carrier {
             points: first..self.points.len() as u32,
             slices: first_slice..self.slices.len() as u32,
-            local_extent: extent,
             deforms: placed.deforms,
             unplaced: false,
         });
@@ -331,7 +341,9 @@ impl World {
     /// There is no such instance.
     pub fn drive(&mut self, instance: u32, world_from_local: DAffine3) -> Result<(), NoInstance> {
         let known = (instance as usize) < self.scene.instances.len();
-        known.then(|| self.driven.insert(instance, world_from_local)).ok_or(NoInstance(instance))?;
+        known
+            .then(|| self.driven.insert(instance, world_from_local))
+            .ok_or(NoInstance(instance))?;
         if !self.moves[instance as usize] {
             self.promote(instance);
         }
@@ -342,11 +354,7 @@ impl World {
     ///
     /// # Errors
     /// There is no such instance, or it has another number of joints.
-    pub fn drive_joints(
-        &mut self,
-        instance: u32,
-        joints: Vec<Affine3A>,
-    ) -> Result<(), NoInstance> {
+    pub fn drive_joints(&mut self, instance: u32, joints: Vec<Affine3A>) -> Result<(), NoInstance> {
         let pose = self.pose.instances.get(instance as usize);
         if !pose.is_some_and(|pose| pose.joints.len() == joints.len() && !joints.is_empty()) {
             return Err(NoInstance(instance));
@@ -412,11 +420,16 @@ impl World {
         std::mem::swap(&mut self.previous, &mut self.pose);
         self.scene.pose(time_s, &mut self.pose);
         for (&instance, world) in &self.driven {
-            let local = DAffine3 { translation: world.translation - self.scene.origin, ..*world };
+            let local = DAffine3 {
+                translation: world.translation - self.scene.origin,
+                ..*world
+            };
             self.pose.instances[instance as usize].world_from_local = single(local);
         }
         for (&instance, joints) in &self.posed {
-            self.pose.instances[instance as usize].joints.clone_from(joints);
+            self.pose.instances[instance as usize]
+                .joints
+                .clone_from(joints);
         }
         deform(&self.scene, &self.pose, &mut self.deformed);
         self.tracer.update(&self.scene, &self.pose, &self.deformed);
@@ -437,7 +450,10 @@ impl World {
     fn mark_stale(&mut self) {
         let mut swept = Vec::new();
         for instance in 0..self.scene.instances.len() {
-            let (old, new) = (&self.previous.instances[instance], &self.pose.instances[instance]);
+            let (old, new) = (
+                &self.previous.instances[instance],
+                &self.pose.instances[instance],
+            );
             let turned = old.world_from_local != new.world_from_local;
             let bent = old.joints != new.joints || old.morph_weights != new.morph_weights;
             if !(self.moves[instance] && (turned || bent)) {
@@ -465,7 +481,9 @@ impl World {
     /// Moves the points of visible deforming instances to their cells in the present pose.
     fn place_deforming(&mut self, visible: &(dyn Fn([Vec3; 2]) -> bool + Sync)) {
         for instance in 0..self.carriers.len() {
-            let Some(carrier) = &self.carriers[instance] else { continue };
+            let Some(carrier) = &self.carriers[instance] else {
+                continue;
+            };
             let seen = |slice: u32| visible(self.slices[slice as usize].bounds);
             if !carrier.unplaced || !carrier.slices.clone().any(seen) {
                 continue;
@@ -549,10 +567,12 @@ impl World {
             let mut rays = slice.rays_done;
             if rays < all {
                 // Deforming points keep no bits, so they start with all rays.
-                let deforms = self.carriers[slice.instance as usize]
-                    .as_ref()
-                    .is_some_and(|carrier| carrier.deforms);
-                let next = if deforms { all } else { (rays * 2).max(FIRST_RAYS).min(all) };
+                let deforms = self.scene.instances[slice.instance as usize].deforms;
+                let next = if deforms {
+                    all
+                } else {
+                    (rays * 2).max(FIRST_RAYS).min(all)
+                };
                 let cost = (next - rays) as u64 * points;
                 if cost <= budget {
                     budget -= cost;
@@ -565,7 +585,10 @@ impl World {
             }
         }
         let done = std::sync::atomic::AtomicU64::new(0);
-        let total: u64 = due.iter().map(|&(slice, _)| self.slices[slice].points.len() as u64).sum();
+        let total: u64 = due
+            .iter()
+            .map(|&(slice, _)| self.slices[slice].points.len() as u64)
+            .sum();
         let traced: Vec<Traced> = due
             .par_iter()
             .map(|&(slice, rays)| {
@@ -598,18 +621,19 @@ impl World {
     fn trace_slice(&self, index: usize, rays: usize) -> Traced {
         let slice = &self.slices[index];
         let instance = slice.instance;
-        let carrier = self.carriers[instance as usize].as_ref();
-        let (deforms, extent) =
-            carrier.map_or((false, Vec3::ZERO), |c| (c.deforms, c.local_extent));
+        let deforms = self.scene.instances[instance as usize].deforms;
         let (attached, others) = match (deforms, self.moves[instance as usize]) {
             (true, _) => (None, Against::All),
-            (false, true) => (Some(Against::Instance(instance)), Against::AllExcept(instance)),
+            (false, true) => (
+                Some(Against::Instance(instance)),
+                Against::AllExcept(instance),
+            ),
             (false, false) => (Some(Against::Static), Against::Movers),
         };
         let triangles = &self.mesh(instance).triangles;
         let (positions, normals) = self.vertices(instance);
-        let world = self.pose.instances[instance as usize].world_from_local;
-        let (to_normal, reach) = (normal_matrix(&world), reach(&world, extent));
+        let pose = &self.pose.instances[instance as usize];
+        let reach = self.reach(instance);
         let t_max = self.options.ao_distance_m;
         let movers = self.movers_near(slice.bounds);
         let words = self.words();
@@ -619,13 +643,15 @@ impl World {
         let mut hit = vec![0u64; words];
         for number in slice.points.clone() {
             let point = &self.points[number as usize];
-            let position = world.transform_point3(point.position(triangles, positions));
-            let turn = |n: Vec3| Vec3::from(to_normal * Vec3A::from(n)).normalize_or(Vec3::Y);
-            let normal = turn(point.normal(triangles, positions, normals));
-            let outward = turn(point.geometric_normal(triangles, positions));
-            let tangent = world.transform_vector3(point.tangent(triangles, positions));
+            let local = point.position(triangles, positions);
+            let position = pose.world_from_local.transform_point3(local);
+            let normal = pose.world_normal(point.normal(triangles, positions, normals));
+            let outward = pose.world_normal(point.geometric_normal(triangles, positions));
+            let tangent = point.tangent(triangles, positions);
+            let tangent = pose.world_from_local.transform_vector3(tangent);
             let origin = offset_origin(position, outward, reach);
-            self.samples.directions(number, normal, tangent, &mut directions);
+            self.samples
+                .directions(number, normal, tangent, &mut directions);
 
             hit.fill(0);
             if let Some(attached) = attached {
@@ -633,7 +659,8 @@ impl World {
                 hit.copy_from_slice(&self.fixed[bits..bits + words]);
                 if rays > slice.rays_done {
                     set_bits(&mut todo, slice.rays_done..rays);
-                    self.tracer.occluded(attached, origin, &directions, t_max, &todo, &mut hit);
+                    self.tracer
+                        .occluded(attached, origin, &directions, t_max, &todo, &mut hit);
                     traced.rays += (rays - slice.rays_done) as u64;
                 }
                 traced.fixed.extend_from_slice(&hit);
@@ -644,7 +671,8 @@ impl World {
             let open = rays as u64 - count(&hit);
             let reached = |mover: &[Vec3; 2]| touches(*mover, [origin; 2], t_max);
             if others != Against::Movers || movers.iter().any(reached) {
-                self.tracer.occluded(others, origin, &directions, t_max, &todo, &mut hit);
+                self.tracer
+                    .occluded(others, origin, &directions, t_max, &todo, &mut hit);
                 traced.rays += open;
             }
             let blocked = count(&hit);
@@ -658,7 +686,10 @@ impl World {
     fn movers_near(&self, bounds: [Vec3; 2]) -> Vec<[Vec3; 2]> {
         let near = |now: &[Vec3; 2]| touches(bounds, *now, self.options.ao_distance_m);
         let movers = (0..self.moves.len()).filter(|&instance| self.moves[instance]);
-        movers.map(|instance| self.swept[instance][0]).filter(near).collect()
+        movers
+            .map(|instance| self.swept[instance][0])
+            .filter(near)
+            .collect()
     }
 
     fn mesh(&self, instance: u32) -> &Mesh {
@@ -667,10 +698,30 @@ impl World {
 
     /// Present local positions and normals of an instance's vertices.
     pub fn vertices(&self, instance: u32) -> (&[Vec3], &[Vec3]) {
-        match self.deformed.binary_search_by_key(&instance, |d| d.instance) {
-            Ok(index) => (&self.deformed[index].positions, &self.deformed[index].normals),
+        match self
+            .deformed
+            .binary_search_by_key(&instance, |d| d.instance)
+        {
+            Ok(index) => (
+                &self.deformed[index].positions,
+                &self.deformed[index].normals,
+            ),
             Err(_) => (&self.mesh(instance).positions, &self.mesh(instance).normals),
         }
+    }
+
+    /// How coarse an instance's world positions are, for [`offset_origin`].
+    pub fn reach(&self, instance: u32) -> f32 {
+        let extent = self.extents[self.scene.instances[instance as usize].mesh as usize];
+        reach(
+            &self.pose.instances[instance as usize].world_from_local,
+            extent,
+        )
+    }
+
+    /// The instance whose buckets include `bucket`.
+    pub fn instance_of_bucket(&self, bucket: u32) -> u32 {
+        self.instance_of_bucket[bucket as usize]
     }
 
     /// The tracer, for pictures.
@@ -685,7 +736,10 @@ impl World {
 
     /// Points that found no room in their cell or bucket.
     pub fn discarded(&self) -> usize {
-        self.places.iter().filter(|&&place| place == Place::NONE).count()
+        self.places
+            .iter()
+            .filter(|&&place| place == Place::NONE)
+            .count()
     }
 
     fn words(&self) -> usize {
@@ -705,8 +759,15 @@ impl World {
     }
 
     fn slice_bounds(&self, slice: usize) -> [Vec3; 2] {
-        let Slice { instance, points, local_bounds, .. } = &self.slices[slice];
-        let deforms = self.carriers[*instance as usize].as_ref().is_some_and(|c| c.deforms);
+        let Slice {
+            instance,
+            points,
+            local_bounds,
+            ..
+        } = &self.slices[slice];
+        let deforms = self.carriers[*instance as usize]
+            .as_ref()
+            .is_some_and(|c| c.deforms);
         let local = if deforms {
             let positions = self.vertices(*instance).0;
             bounds_of(self.local_positions(*instance, points.clone(), positions))
@@ -761,18 +822,6 @@ fn single(matrix: DAffine3) -> Affine3A {
     Affine3A::from_mat3_translation(matrix.matrix3.as_mat3(), matrix.translation.as_vec3())
 }
 
-/// Local normals to world, before normalising; keeps "outward" under mirrored placements.
-pub fn normal_matrix(world_from_local: &Affine3A) -> Mat3A {
-    // The adjugate's transpose is the inverse's up to the determinant, and exists for flat ones.
-    let m = world_from_local.matrix3;
-    let cofactors = Mat3A::from_cols(
-        m.y_axis.cross(m.z_axis),
-        m.z_axis.cross(m.x_axis),
-        m.x_axis.cross(m.y_axis),
-    );
-    if m.determinant() < 0.0 { -cofactors } else { cofactors }
-}
-
 /// Metres a local unit along each axis.
 pub fn scale_of(world_from_local: &Affine3A) -> Vec3 {
     let m = world_from_local.matrix3;
@@ -780,7 +829,9 @@ pub fn scale_of(world_from_local: &Affine3A) -> Vec3 {
 }
 
 fn bounds_of(positions: impl Iterator<Item = Vec3>) -> [Vec3; 2] {
-    positions.fold([Vec3::INFINITY, Vec3::NEG_INFINITY], |[min, max], p| [min.min(p), max.max(p)])
+    positions.fold([Vec3::INFINITY, Vec3::NEG_INFINITY], |[min, max], p| {
+        [min.min(p), max.max(p)]
+    })
 }
 
 fn placed_bounds(world_from_local: &Affine3A, [min, max]: [Vec3; 2]) -> [Vec3; 2] {
@@ -822,7 +873,9 @@ fn place_points(
             let mesh = &scene.meshes[instance.mesh as usize];
             if let Some(d) = deformed.iter().find(|d| d.instance as usize == index) {
                 let posed = area(&mesh.triangles, &d.positions, scale);
-                scale = Vec3::splat((posed / area(&mesh.triangles, &mesh.positions, Vec3::ONE)).sqrt() as f32);
+                scale = Vec3::splat(
+                    (posed / area(&mesh.triangles, &mesh.positions, Vec3::ONE)).sqrt() as f32,
+                );
             }
         }
         if !(scale.is_finite() && scale.min_element() > 0.0) {
@@ -830,7 +883,9 @@ fn place_points(
         }
         let percent = |ratio: f32| ((ratio.ln() * 100.0).round()) as i32;
         let ratios = [percent(scale.y / scale.x), percent(scale.z / scale.x)];
-        sets.entry((instance.mesh, ratios)).or_default().push((index as u32, scale));
+        sets.entry((instance.mesh, ratios))
+            .or_default()
+            .push((index as u32, scale));
     }
     let done = std::sync::atomic::AtomicU64::new(0);
     let total = sets.len() as u64;
@@ -847,18 +902,29 @@ fn place_points(
             let largest = users.iter().map(|(_, s)| *s).fold(Vec3::ZERO, |a, b| {
                 if volume(&b) > volume(&a) { b } else { a }
             });
-            let set = generate(mesh, largest, options.density, options.seed + u64::from(*mesh_index))?;
+            let set = generate(
+                mesh,
+                largest,
+                options.density,
+                options.seed + u64::from(*mesh_index),
+            )?;
             let placed = users
                 .par_iter()
                 .filter_map(|&(instance, scale)| {
                     let share = (scale / largest).powf(2.0).element_sum() / 3.0;
                     let count = (set.points.len() as f32 * share).round() as usize;
-                    let points = &set.points[..count.clamp(1, set.points.len().max(1)).min(set.points.len())];
+                    let points = &set.points[..count
+                        .clamp(1, set.points.len().max(1))
+                        .min(set.points.len())];
                     let local_scale = scale_of(&pose.instances[instance as usize].world_from_local);
                     place_instance(scene, deformed, options, instance, local_scale, points)
                 })
                 .collect();
-            progress("points", done.fetch_add(1, std::sync::atomic::Ordering::Relaxed) + 1, total);
+            progress(
+                "points",
+                done.fetch_add(1, std::sync::atomic::Ordering::Relaxed) + 1,
+                total,
+            );
             Ok(placed)
         })
         .collect::<Result<_, PointError>>()?;
@@ -886,23 +952,59 @@ fn place_instance(
         Some(d) => (&d.positions, &d.normals),
         None => (&mesh.positions, &mesh.normals),
     };
-    let local: Vec<Vec3> = points.iter().map(|p| p.position(&mesh.triangles, positions)).collect();
+    let local: Vec<Vec3> = points
+        .iter()
+        .map(|p| p.position(&mesh.triangles, positions))
+        .collect();
     let bounds = bounds_of(local.iter().copied());
     // Room to move in before the first new grid.
-    let margin = if deforms { (bounds[1] - bounds[0]) * 0.25 } else { Vec3::ZERO };
+    let margin = if deforms {
+        (bounds[1] - bounds[0]) * 0.25
+    } else {
+        Vec3::ZERO
+    };
     let bounds = [bounds[0] - margin, bounds[1] + margin];
-    let grid = fit(bounds, scale, options.cell_m(), 1.0 / options.cell_over_radius)?;
-    let points: Vec<SurfacePoint> =
-        morton_order(&local, bounds).into_iter().map(|i| points[i as usize]).collect();
+    let grid = fit(
+        bounds,
+        scale,
+        options.cell_m(),
+        1.0 / options.cell_over_radius,
+    )?;
+    let points: Vec<SurfacePoint> = morton_order(&local, bounds)
+        .into_iter()
+        .map(|i| points[i as usize])
+        .collect();
     let placements: Vec<Option<Placement>> = points
         .iter()
         .map(|p| {
             let position = p.position(&mesh.triangles, positions);
-            Placement::of(&grid, position, p.normal(&mesh.triangles, positions, normals))
+            Placement::of(
+                &grid,
+                position,
+                p.normal(&mesh.triangles, positions, normals),
+            )
         })
         .collect();
-    let cells = placements.iter().flatten().map(|at| at.cell).collect::<HashSet<_>>().len();
-    Some(Placed { instance, deforms, points, placements, grid, cells })
+    let cells = placements
+        .iter()
+        .flatten()
+        .map(|at| at.cell)
+        .collect::<HashSet<_>>()
+        .len();
+    Some(Placed {
+        instance,
+        deforms,
+        points,
+        placements,
+        grid,
+        cells,
+    })
+}
+
+fn extent(mesh: &Mesh) -> Vec3 {
+    mesh.positions
+        .iter()
+        .fold(Vec3::ZERO, |extent, p| extent.max(p.abs()))
 }
 
 fn area(triangles: &[[u32; 3]], positions: &[Vec3], scale: Vec3) -> f64 {
