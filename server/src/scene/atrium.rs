@@ -7,15 +7,15 @@
 use std::collections::HashMap;
 use std::f64::consts::TAU;
 
-use glam::{DMat3, DQuat, DVec3, Mat4, Quat, Vec3};
+use glam::{DMat3, DQuat, DVec3, DVec4, Mat4, Quat, Vec3, Vec4Swizzles};
 
 use super::{
     Animation, Channel, Instance, Interpolation, Keys, LocalTransform, Mesh, Morph, Node, Pose,
     Scene, Skin,
 };
 
-/// Sine and cosine of a number of turns.
-fn sin_cos(turns: f64) -> (f64, f64) {
+/// Sine and cosine of a number of turns, the same on every machine.
+pub(super) fn sin_cos(turns: f64) -> (f64, f64) {
     let quarter = (turns * 4.0).round();
     let x = (turns * 4.0 - quarter) * (TAU / 4.0);
     // Taylor series; |x| is at most an eighth of a turn, where 9 terms leave less than 1e-16.
@@ -221,58 +221,86 @@ fn ellipse(centre: DVec3, x: f64, z: f64, phase: f64, count: usize) -> Vec<DVec3
         .collect()
 }
 
+/// `count` points on a level racetrack, equally far apart along it: two straights, from
+/// `-x` to `x`, and half circles of radius `z`.
+fn racetrack(centre: DVec3, x: f64, z: f64, count: usize) -> Vec<DVec3> {
+    let (straight, bend) = (2.0 * x, z * TAU / 2.0);
+    let half = straight + bend;
+    (0..count)
+        .map(|k| {
+            let along = 2.0 * half * k as f64 / count as f64;
+            let (along, side) = if along < half {
+                (along, 1.0)
+            } else {
+                (along - half, -1.0)
+            };
+            let (sin, cos) = sin_cos((along - straight).max(0.0) / bend / 2.0);
+            centre + DVec3::new(along.min(straight) - x + z * sin, 0.0, z * cos) * side
+        })
+        .collect()
+}
+
 /// The orientations of a ball that rolls along a closed path of its centre, one a point and the
 /// first again at the end.
 ///
 /// Rolling without slipping fixes the angular velocity but for the spin about the vertical, which
-/// does not move the point of contact. A ball that has rolled around a loop is turned; so the spin
-/// is chosen, `a + b cos + c sin` over the loop, such that it comes back as it started.
+/// does not move the point of contact. A ball that has rolled around a loop is turned; so a spin
+/// is chosen such that it comes back as it started: a steady one, which settles how far the ball
+/// turns about its mean axis, and a swing in time with the rolling for the other two axes.
 fn roll(path: &[DVec3], radius: f64) -> Vec<DQuat> {
     let count = path.len();
     let steps: Vec<DVec3> = (0..count)
         .map(|k| DVec3::Y.cross(path[(k + 1) % count] - path[k]) / radius)
         .collect();
-    let waves: Vec<DVec3> = (0..count)
-        .map(|k| sin_cos(k as f64 / count as f64))
-        .map(|(sin, cos)| DVec3::new(1.0, cos, sin) / count as f64)
-        .collect();
-    let turn = |spin: DVec3, k: usize| rotation(steps[k] + DVec3::Y * spin.dot(waves[k]));
+    // Orientations under a spin (radians over the loop) a step.
+    let follow = |spin: &dyn Fn(usize) -> f64| {
+        let mut orientations = vec![DQuat::IDENTITY];
+        for k in 0..count {
+            let turn = rotation(steps[k] + DVec3::Y * (spin(k) / count as f64));
+            orientations.push((turn * orientations[k]).normalize());
+        }
+        orientations
+    };
     // Twice the vector part of the whole loop's rotation: zero where the loop closes.
-    let rest = |spin: DVec3| {
-        let whole = (0..count)
-            .fold(DQuat::IDENTITY, |q, k| turn(spin, k) * q)
-            .normalize();
+    let rest = |orientations: &[DQuat]| {
+        let whole = orientations[count];
         DVec3::new(whole.x, whole.y, whole.z) * (2.0 * whole.w.signum())
     };
-    // Newton from several starts; the gentlest solution.
-    let mut best = (f64::INFINITY, DVec3::ZERO);
-    for start in 0..27 {
-        let digit = |place: i32| f64::from(start / place % 3 - 1) * 2.0;
-        let mut spin = DVec3::new(digit(1), digit(3), digit(9));
-        let mut error = rest(spin);
-        for _ in 0..12 {
-            let slope = |along: DVec3| (rest(spin + along * 1e-6) - error) / 1e-6;
-            let jacobian = DMat3::from_cols(slope(DVec3::X), slope(DVec3::Y), slope(DVec3::Z));
-            let step = jacobian.inverse() * error;
-            if !step.is_finite() {
-                break;
-            }
-            spin -= step.clamp_length_max(1.0);
-            error = rest(spin);
+    // Newton, the least step each time, from several steady spins; the gentlest solution.
+    let mut gentlest = (f64::INFINITY, follow(&|_| 0.0));
+    for start in -10..=10 {
+        let steady = follow(&|_| f64::from(start) * 2.0);
+        let vertical: Vec<DVec3> = steady.iter().map(|q| q.conjugate() * DVec3::Y).collect();
+        let try_out = |spin: DVec4| follow(&|k| spin.x + spin.yzw().dot(vertical[k]));
+        let mut spin = DVec4::new(f64::from(start) * 2.0, 0.0, 0.0, 0.0);
+        for _ in 0..16 {
+            let orientations = try_out(spin);
+            let error = rest(&orientations);
             if error.length() < 1e-11 {
-                if spin.length() < best.0 {
-                    best = (spin.length(), spin);
+                if spin.length() < gentlest.0 {
+                    gentlest = (spin.length(), orientations);
                 }
                 break;
             }
+            let slopes = [DVec4::X, DVec4::Y, DVec4::Z, DVec4::W]
+                .map(|along| (rest(&try_out(spin + along * 1e-6)) - error) / 1e-6);
+            let square =
+                |slope: DVec3| DMat3::from_cols(slope * slope.x, slope * slope.y, slope * slope.z);
+            let squares = slopes
+                .map(square)
+                .into_iter()
+                .fold(DMat3::ZERO, |sum, m| sum + m);
+            let along = squares.inverse() * error;
+            let step = DVec4::from(slopes.map(|slope| slope.dot(along)));
+            if !step.is_finite() {
+                break;
+            }
+            spin -= step.clamp_length_max(3.0);
         }
     }
     // What is left (rounding, or all of it for a path that no spin closes) goes evenly.
-    let mut orientations = vec![DQuat::IDENTITY];
-    for k in 0..count {
-        orientations.push((turn(best.1, k) * orientations[k]).normalize());
-    }
-    let error = rest(best.1);
+    let mut orientations = gentlest.1;
+    let error = rest(&orientations);
     for (k, orientation) in orientations.iter_mut().enumerate() {
         *orientation = rotation(error * (-(k as f64) / count as f64)) * *orientation;
     }
@@ -399,16 +427,13 @@ impl Scene {
             }
         }
         let mesh = figure(&mut scene);
-        walker(
-            &mut scene,
-            mesh,
-            &ellipse(DVec3::new(-0.6, 0.0, -3.3), 3.5, 0.25, 0.0, 256),
-        );
-        walker(
-            &mut scene,
-            mesh,
-            &ellipse(DVec3::new(-0.4, 0.0, 3.25), 3.0, 0.25, 0.4, 256),
-        );
+        for (x, z) in [(-0.6, -3.3), (-0.4, 3.25)] {
+            walker(
+                &mut scene,
+                mesh,
+                &racetrack(DVec3::new(x, 0.0, z), 3.0, 0.3, 256),
+            );
+        }
         scene.finish();
         scene
     }
@@ -417,7 +442,8 @@ impl Scene {
     /// 1000. `seed` varies the paths; the same seed gives the same boulders.
     ///
     /// They follow the floor that lies under their path at time 0, and pass through what stands on
-    /// it. Without a floor they float at half the scene's height.
+    /// it. Without a floor they float at half the scene's height. Where it is level they roll
+    /// without slipping.
     pub fn add_movers(&mut self, n: usize, seed: u64) {
         let n = n.min(1000);
         if n == 0 {
@@ -1092,5 +1118,275 @@ fn bend(joint: &str, phase: f64) -> f64 {
         "forearm" => -0.35 + 0.15 * sin,
         "spine" => 0.04,
         _ => 0.0,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn translation(scene: &Scene, instance: usize, time_s: f64, pose: &mut Pose) -> DVec3 {
+        scene.pose(time_s, pose);
+        let at = pose.instances[instance].world_from_local;
+        Vec3::from(at.translation).as_dvec3() + scene.origin
+    }
+
+    fn boulders(scene: &Scene) -> Vec<usize> {
+        (0..scene.instances.len())
+            .filter(|&i| scene.instances[i].name == "boulder")
+            .collect()
+    }
+
+    /// A level square floor of 20 m at a height, with walls' worth of height above it.
+    fn hall(height: f64) -> Scene {
+        let mut scene = Scene::default();
+        let mut floor = Mesh::default();
+        cuboid(
+            &mut floor,
+            [-10.0, height - 0.3, -10.0],
+            [10.0, height, 10.0],
+        );
+        cuboid(
+            &mut floor,
+            [-10.0, height, -10.0],
+            [-9.9, height + 6.0, 10.0],
+        );
+        let floor = add_mesh(&mut scene, floor);
+        place(&mut scene, "floor", floor, [0.0; 3], [1.0; 3]);
+        scene.finish();
+        scene
+    }
+
+    #[test]
+    fn sine_and_cosine_agree_with_the_platforms() {
+        for i in -1000..1000 {
+            let turns = f64::from(i) / 173.0;
+            let (sin, cos) = sin_cos(turns);
+            let (expected_sin, expected_cos) = (turns * TAU).sin_cos();
+            assert!((sin - expected_sin).abs() < 1e-14 && (cos - expected_cos).abs() < 1e-14);
+        }
+    }
+
+    #[test]
+    fn a_loop_of_rolling_closes_by_a_gentle_spin() {
+        for (x, z, radius) in [
+            (1.0, 0.9, 0.5),
+            (1.2, 1.05, 0.25),
+            (6.0, 2.0, 0.4),
+            (3.0, 9.0, 0.6),
+        ] {
+            let length = path_length(&ellipse(DVec3::ZERO, x, z, 0.0, 256));
+            let path = ellipse(DVec3::ZERO, x, z, 0.2, path_points(length, radius));
+            let orientations = roll(&path, radius);
+            let (first, last) = (orientations[0], orientations[path.len()]);
+            assert!(first.dot(last).abs() > 1.0 - 1e-12, "{x} {z} {radius}");
+            for k in 0..path.len() {
+                let turn = orientations[k + 1] * orientations[k].inverse();
+                let turn = if turn.w < 0.0 { -turn } else { turn };
+                let vector = DVec3::new(turn.x, turn.y, turn.z);
+                let angular = vector.normalize() * 2.0 * vector.length().asin();
+                let moved = path[(k + 1) % path.len()] - path[k];
+                // The point of contact moves with the centre and around it.
+                let slip = moved + angular.cross(DVec3::Y * -radius);
+                assert!(slip.length() < 1e-6 * moved.length(), "{slip} of {moved}");
+                assert!(angular.y.abs() < angular.length() / 2.0, "spins: {angular}");
+            }
+        }
+    }
+
+    #[test]
+    fn boulders_roll_without_slipping_in_the_posed_scene() {
+        let atrium = Scene::atrium();
+        let mut moved = hall(3.0);
+        moved.add_movers(3, 7);
+        let mut pose = Pose::default();
+        for scene in [&atrium, &moved] {
+            for instance in boulders(scene) {
+                let mesh = &scene.meshes[scene.instances[instance].mesh as usize];
+                let radius: f32 = mesh.positions.iter().map(|p| p.length()).sum::<f32>()
+                    / mesh.positions.len() as f32;
+                for time_s in [0.31, 2.77, 5.123, 1000.71] {
+                    // Over a hundredth of a second, from the orientation and the centre alone.
+                    let step = 0.01;
+                    let before = translation(scene, instance, time_s, &mut pose);
+                    let turned = pose.instances[instance].world_from_local.matrix3;
+                    let after = translation(scene, instance, time_s + step, &mut pose);
+                    let turn =
+                        pose.instances[instance].world_from_local.matrix3 * turned.transpose();
+                    let angular = Vec3::new(
+                        turn.y_axis.z - turn.z_axis.y,
+                        turn.z_axis.x - turn.x_axis.z,
+                        turn.x_axis.y - turn.y_axis.x,
+                    ) / 2.0;
+                    let centre = (after - before).as_vec3();
+                    let slip = centre + angular.cross(Vec3::Y * -radius);
+                    assert!(centre.length() > 0.002, "{} stands still", mesh.name);
+                    assert!(slip.length() < 0.06 * centre.length(), "{slip} of {centre}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn nothing_jumps_where_its_animation_starts_again() {
+        let scene = Scene::atrium();
+        let mut pose = Pose::default();
+        let (mut before, mut after, mut normals) = (Vec::new(), Vec::new(), Vec::new());
+        for animation in &scene.animations {
+            let end = f64::from(animation.duration_s);
+            for instance in 0..scene.instances.len() {
+                let mut vertices = |time_s, out: &mut Vec<Vec3>| {
+                    scene.pose(time_s, &mut pose);
+                    let at = &pose.instances[instance];
+                    scene.deform(instance, at, out, &mut normals);
+                    out.iter_mut()
+                        .for_each(|p| *p = at.world_from_local.transform_point3(*p));
+                };
+                if scene.instances[instance].moves || scene.instances[instance].deforms {
+                    vertices(end - 0.001, &mut before);
+                    vertices(end + 0.001, &mut after);
+                    // Nothing is faster than 4 m/s.
+                    let far = before.iter().zip(&after).map(|(a, b)| a.distance(*b));
+                    let far = far.fold(0.0, f32::max);
+                    let name = &scene.instances[instance].name;
+                    assert!(far < 0.008, "{name} by {far} m as {} ends", animation.name);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn the_atriums_boulders_keep_clear_of_columns_and_of_each_other() {
+        let scene = Scene::atrium();
+        let mut pose = Pose::default();
+        let boulders = boulders(&scene);
+        assert_eq!(boulders.len(), 6);
+        let size = |instance: usize| {
+            let mesh = &scene.meshes[scene.instances[instance].mesh as usize];
+            f64::from(
+                mesh.positions
+                    .iter()
+                    .map(|p| p.length())
+                    .fold(0.0, f32::max),
+            )
+        };
+        for step in 0..300 {
+            let time_s = f64::from(step) * 0.17;
+            let places: Vec<DVec3> = boulders
+                .iter()
+                .map(|&i| translation(&scene, i, time_s, &mut pose))
+                .collect();
+            for (i, &place) in places.iter().enumerate() {
+                for x in TALL_COLUMNS_X {
+                    let away = DVec3::new(place.x - x, 0.0, place.z - 1.0).length();
+                    assert!(away > size(boulders[i]) + 0.28, "{away}");
+                }
+                for (j, other) in places.iter().enumerate().take(i) {
+                    assert!(place.distance(*other) > size(boulders[i]) + size(boulders[j]));
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn the_figures_walk_on_the_floor() {
+        let scene = Scene::atrium();
+        let mut pose = Pose::default();
+        let (mut positions, mut normals) = (Vec::new(), Vec::new());
+        for instance in 0..scene.instances.len() {
+            if scene.instances[instance].skin.is_none() {
+                continue;
+            }
+            for step in 0..60 {
+                scene.pose(f64::from(step) * 0.11, &mut pose);
+                let at = &pose.instances[instance];
+                scene.deform(instance, at, &mut positions, &mut normals);
+                let height =
+                    |p: &Vec3| at.world_from_local.transform_point3(*p).y + scene.origin.y as f32;
+                let low = positions.iter().map(height).fold(f32::INFINITY, f32::min);
+                let high = positions.iter().map(height).fold(0.0, f32::max);
+                assert!((-0.03..0.1).contains(&low), "{low}");
+                assert!((1.6..2.0).contains(&high), "{high}");
+            }
+        }
+    }
+
+    #[test]
+    fn movers_stand_on_the_floor_under_their_paths_or_float() {
+        let mut pose = Pose::default();
+        for height in [0.0, 3.0] {
+            let mut scene = hall(height);
+            scene.add_movers(5, 1);
+            for instance in boulders(&scene) {
+                let y = translation(&scene, instance, 1.7, &mut pose).y;
+                // 0.02 of 20 m, above the floor.
+                assert!((y - height - 0.4).abs() < 1e-4, "{y}");
+            }
+        }
+        // A tall post with nothing around it: no floor.
+        let mut scene = Scene::default();
+        let mut post = Mesh::default();
+        cuboid(&mut post, [-10.0, 0.0, 0.0], [-9.9, 8.0, 0.1]);
+        cuboid(&mut post, [10.0, 0.0, 19.9], [10.1, 8.0, 20.0]);
+        let post = add_mesh(&mut scene, post);
+        place(&mut scene, "post", post, [0.0; 3], [1.0; 3]);
+        scene.finish();
+        scene.add_movers(3, 1);
+        for instance in boulders(&scene) {
+            assert!((translation(&scene, instance, 1.7, &mut pose).y - 4.0).abs() < 1e-4);
+        }
+    }
+
+    #[test]
+    fn movers_follow_a_floor_that_rises_and_ignore_what_stands_on_it() {
+        let ramp: Vec<Vec<f64>> = (0..200)
+            .map(|k| 1.0 - (f64::from(k) / 100.0 - 1.0).abs())
+            .map(|y| vec![y])
+            .collect();
+        let heights = follow_floor(&ramp, 0.4).unwrap();
+        assert!(
+            heights
+                .iter()
+                .zip(&ramp)
+                .all(|(height, floor)| (height - floor[0]).abs() < 0.05)
+        );
+        let mut crates = vec![vec![0.0]; 100];
+        crates[40..60]
+            .iter_mut()
+            .for_each(|heights| *heights = vec![0.0, 1.0]);
+        assert!(
+            follow_floor(&crates, 0.4)
+                .unwrap()
+                .iter()
+                .all(|&height| height == 0.0)
+        );
+        let mut hole = vec![vec![0.0]; 100];
+        hole[40..60].iter_mut().for_each(|heights| heights.clear());
+        assert!(
+            follow_floor(&hole, 0.4)
+                .unwrap()
+                .iter()
+                .all(|&height| height == 0.0)
+        );
+        assert!(follow_floor(&vec![Vec::new(); 100], 0.4).is_none());
+    }
+
+    #[test]
+    fn the_same_seed_gives_the_same_movers_and_far_out_too() {
+        let with = |seed, far: f64| {
+            let mut scene = hall(0.0);
+            scene.transform(glam::DAffine3::from_translation(DVec3::new(far, 0.0, -far)));
+            scene.add_movers(3, seed);
+            scene
+        };
+        assert_eq!(with(1, 0.0).hash(), with(1, 0.0).hash());
+        assert_ne!(with(1, 0.0).hash(), with(2, 0.0).hash());
+        let (near, far) = (with(1, 0.0), with(1, 1e6));
+        let (mut near_pose, mut far_pose) = (Pose::default(), Pose::default());
+        near.pose(3.3, &mut near_pose);
+        far.pose(3.3, &mut far_pose);
+        for (a, b) in near_pose.instances.iter().zip(&far_pose.instances) {
+            assert!(a.world_from_local.abs_diff_eq(b.world_from_local, 1e-4));
+        }
     }
 }

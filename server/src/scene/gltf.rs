@@ -20,6 +20,7 @@ use json::mesh::{Mode, Semantic};
 use json::texture::WrappingMode;
 use json::validation::Checked;
 
+use super::atrium::sin_cos;
 use super::{
     Animation, Channel, Instance, Interpolation, Keys, LocalTransform, Mask, Mesh, Morph, Node,
     Pose, Scene, SceneError, Skin, Wrap,
@@ -314,7 +315,9 @@ struct UvTransform {
 
 impl UvTransform {
     fn apply(&self, uv: Vec2) -> Vec2 {
-        let (sin, cos) = self.rotation.sin_cos();
+        // Not the platform's sine: Scene::hash must not differ by its last bit.
+        let (sin, cos) = sin_cos(f64::from(self.rotation) / std::f64::consts::TAU);
+        let (sin, cos) = (sin as f32, cos as f32);
         let uv = uv * self.scale;
         self.offset + Vec2::new(cos * uv.x + sin * uv.y, cos * uv.y - sin * uv.x)
     }
