@@ -1,5 +1,6 @@
 //! The PSAO reference server: `scene ─► points ─► occlusion ─► select ─► encode ─► transport`.
 
+pub mod camera;
 pub mod metrics;
 pub mod picture;
 pub mod report;
