@@ -50,7 +50,7 @@ fn sample() -> Report {
             .map(|i| (f64::from(i) / 60.0, f(f64::from(i))))
             .collect()
     };
-    let noise = |i: f64| (i * 12.9898).sin() * 43_758.5453 % 1.0;
+    let noise = |i: f64| (i * 12.9898).sin() * 43_758.5 % 1.0;
     let plot = |title: &str, y_label: &str, series: Vec<(&str, Vec<(f64, f64)>)>| Plot {
         title: title.into(),
         x_label: "time (s)".into(),
