@@ -176,12 +176,14 @@ const CLEARANCE: f32 = 0.3;
 const COLUMNS: usize = 24;
 
 impl CameraPath {
-    /// Chooses a path through any scene, from its bounds and ray casts alone.
+    /// Chooses a path through any scene, from its bounds and ray casts (up to some two million)
+    /// alone.
     ///
-    /// Where most places to stand are walled in, it walks an ellipse at eye height: 1.6 m above
-    /// the floor, within 10 to 65 % of the scene's height for scenes in other units. It keeps
-    /// 0.3 times that from every surface and looks along the longer free ways, the middle
-    /// preferred, slightly down. Anything else it circles, looking at the middle from above.
+    /// Where most places to stand are walled in, it walks an ellipse at eye height, where there is
+    /// room and much to see. Eyes are 1.6 m above the floor, but within 10 to 65 % of the scene's
+    /// height, for scenes in other units. It keeps 0.3 times that from every surface and looks
+    /// along the longer free ways, the middle preferred, slightly down. Anything else it circles,
+    /// looking at the middle from above.
     ///
     /// Even and odd `which` differ in place, size and sense: tune on one, report the other. The
     /// same scene always gives the same path. `aspect` is the picture's width over its height.
@@ -411,53 +413,87 @@ impl<'a> Walk<'a> {
         })
     }
 
-    /// The roomiest round.
+    /// The best round: roomy, with much to see.
     fn ellipse(&self, odd: bool) -> Option<Ellipse> {
-        // Half axes that fit at a place by the free ways from its middle.
+        let score = |e: &Ellipse, detail: f32| (e.area().sqrt() + 0.1 * self.eye) * (detail + 0.02);
+        // At every place, the free ways from it give the half axes that may fit.
         let longest = 12.0 * self.eye;
-        let fit = |center: Vec3| {
-            let best = (0..4).map(|i| {
-                let angle = std::f32::consts::FRAC_PI_4 * i as f32;
+        let fits = |center: Vec3| {
+            [0.0, 0.125, 0.25, 0.375].map(|part| {
+                let angle = std::f32::consts::PI * part;
                 let axes = [level(angle), level(angle + std::f32::consts::FRAC_PI_2)].map(|axis| {
                     let free = self.free(center, axis).min(self.free(center, -axis));
                     axis * free.min(longest)
                 });
                 Ellipse { center, axes }
-            });
-            best.max_by(|a, b| a.area().total_cmp(&b.area()))
+            })
         };
-        let mut rounds: Vec<Ellipse> = self.places.par_iter().filter_map(|p| fit(*p)).collect();
-        rounds.sort_by(|a, b| b.area().total_cmp(&a.area()));
+        let rate = |&place: &Vec3| {
+            let (fits, detail) = (fits(place), self.detail(place));
+            let best = fits.iter().map(|e| score(e, detail)).fold(0.0, f32::max);
+            (best, detail, fits)
+        };
+        let mut rounds: Vec<_> = self.places.par_iter().map(rate).collect();
+        rounds.sort_by(|a, b| b.0.total_cmp(&a.0));
         // The best few that are not all in one spot.
         let apart = 0.05 * (self.bounds[1] - self.bounds[0]).length();
-        let mut few: Vec<Ellipse> = Vec::new();
-        for ellipse in rounds {
-            if few.len() < 16
-                && few
-                    .iter()
-                    .all(|e| e.center.distance(ellipse.center) > apart)
-            {
-                few.push(ellipse);
+        let mut few: Vec<(f32, Ellipse)> = Vec::new();
+        for (_, detail, fits) in rounds {
+            let far = |(_, e): &(f32, Ellipse)| e.center.distance(fits[0].center) > apart;
+            if few.len() < 64 && few.iter().all(far) {
+                few.extend(fits.map(|e| (detail, e)));
             }
         }
-        // The last one stands still.
-        let scales: &[f32] = if odd {
-            &[0.6, 0.45, 0.3, 0.15, 0.0]
+        // Then both axes shrink, each for itself, until one can walk there; at worst stand.
+        let parts: &[f32] = if odd {
+            &[0.6, 0.4, 0.2]
         } else {
-            &[0.8, 0.65, 0.5, 0.35, 0.2, 0.0]
+            &[0.8, 0.6, 0.4, 0.2]
         };
-        let walkable: Vec<Ellipse> = few
-            .par_iter()
-            .filter_map(|e| {
-                scales
-                    .iter()
-                    .map(|s| e.scaled(*s))
-                    .find(|e| self.is_walkable(e))
-            })
+        let mut scales: Vec<[f32; 2]> = parts
+            .iter()
+            .flat_map(|a| parts.iter().map(|b| [*a, *b]))
+            .chain([[0.0; 2]])
             .collect();
+        scales.sort_by(|a, b| (b[0] * b[1]).total_cmp(&(a[0] * a[1])));
+        let walkable = few.par_iter().filter_map(|(detail, ellipse)| {
+            let mut smaller = scales.iter().map(|s| ellipse.scaled(*s));
+            smaller
+                .find(|e| self.is_walkable(e))
+                .map(|e| (score(&e, *detail), e))
+        });
+        let walkable: Vec<(f32, Ellipse)> = walkable.collect();
         walkable
             .into_iter()
-            .reduce(|a, b| if b.area() > a.area() { b } else { a })
+            .reduce(|a, b| if b.0 > a.0 { b } else { a })
+            .map(|(_, e)| e)
+    }
+
+    /// How much there is to see from a place: the share of neighbouring rays that do not end on
+    /// one plane. 0 in the open, little between bare walls.
+    fn detail(&self, place: Vec3) -> f32 {
+        const AROUND: usize = 32;
+        let (mut edges, mut pairs) = (0, 0);
+        for height in [-0.5, -0.25, 0.0, 0.25, 0.5] {
+            let ends: Vec<Option<(Vec3, Vec3)>> = (0..AROUND)
+                .map(|i| {
+                    let way = level(std::f32::consts::TAU * i as f32 / AROUND as f32);
+                    let way = (way + Vec3::Y * height).normalize();
+                    (self.closest)(place, way).map(|(t, normal)| (place + way * t, normal))
+                })
+                .collect();
+            for i in 0..AROUND {
+                pairs += 1;
+                edges += match (ends[i], ends[(i + 1) % AROUND]) {
+                    (Some((a, normal)), Some((b, _))) => {
+                        usize::from(normal.dot(b - a).abs() > 0.05 * a.distance(b))
+                    }
+                    (None, None) => 0,
+                    _ => 1,
+                };
+            }
+        }
+        edges as f32 / pairs as f32
     }
 
     /// Clear, with a floor below, and nothing between one step and the next.
@@ -517,10 +553,10 @@ impl Ellipse {
         self.axes[0].length() * self.axes[1].length()
     }
 
-    fn scaled(&self, scale: f32) -> Self {
+    fn scaled(&self, by: [f32; 2]) -> Self {
         Self {
             center: self.center,
-            axes: self.axes.map(|axis| axis * scale),
+            axes: [self.axes[0] * by[0], self.axes[1] * by[1]],
         }
     }
 }
