@@ -723,20 +723,22 @@ fn flattened_and_broken_placements_are_never_hit_and_hide_nothing_else() {
 
 #[test]
 fn geometry_that_is_all_in_one_place_still_builds_and_traces() {
-    // The same triangle over and over, and triangles nested within each other: what makes chains
-    // of trees.
-    for grow in [1.0f32, 1.001, 1.2] {
+    // The same triangle over and over, and triangles that tower over each other, each a little
+    // larger: these make trees that are chains.
+    for grow in [1.0f32, 1.001, 1.05] {
         let mut mesh = Mesh::default();
-        let mut size = 1.0f32;
-        for i in 0..20_000 {
+        let mut sizes = vec![1.0f32];
+        while sizes.len() < 20_000 && sizes[sizes.len() - 1] < 1e5 {
+            sizes.push(sizes[sizes.len() - 1] * grow);
+        }
+        for (i, size) in sizes.iter().enumerate() {
             let corners = [
-                vec3(-1.0, 0.0, -1.0),
-                vec3(1.0, 0.0, -1.0),
-                vec3(0.0, 0.0, 1.0),
+                vec3(-1.0, 1.0, -1.0),
+                vec3(1.0, 1.0, -1.0),
+                vec3(0.0, 1.0, 1.0),
             ];
-            mesh.positions.extend(corners.map(|p| p * size));
-            mesh.triangles.push([3 * i, 3 * i + 1, 3 * i + 2]);
-            size = if size > 1e6 { 1.0 } else { size * grow };
+            mesh.positions.extend(corners.map(|p| p * *size));
+            mesh.triangles.push([0, 1, 2].map(|k| 3 * i as u32 + k));
         }
         for deforms in [false, true] {
             let mut scene = Scene::default();
@@ -744,21 +746,39 @@ fn geometry_that_is_all_in_one_place_still_builds_and_traces() {
             scene.meshes.push(mesh.clone());
             place(&mut scene, &mut pose, 0, Affine3A::IDENTITY, deforms);
             let tracer = CpuTracer::new(&scene, &pose, &[], &[deforms]).unwrap();
-            assert!(one(
-                &tracer,
-                Against::All,
-                vec3(0.0, 1.0, 0.0),
-                Vec3::NEG_Y,
-                2.0
-            ));
-            assert!(!one(
-                &tracer,
-                Against::All,
-                vec3(0.0, 1.0, 0.0),
-                Vec3::Y,
-                0.5
-            ));
+            let all = Against::All;
+            for size in &sizes {
+                let (down, below) = (size * 0.0004, Vec3::Y * *size * 0.9998);
+                assert!(
+                    !one(&tracer, all, below, Vec3::NEG_Y, down),
+                    "{grow} {size}"
+                );
+                assert!(one(&tracer, all, below, Vec3::Y, down), "{grow} {size}");
+            }
         }
+    }
+}
+
+#[test]
+fn trees_stay_shallow_however_boxes_are_nested() {
+    // Deep ones would overflow the stack of what is recursive in the builder.
+    for grow in [1.0f32, 1.001, 1.05, 2.0] {
+        let mut size = 1.0f32;
+        let mut boxes = Vec::new();
+        while boxes.len() < 5000 && size < 1e6 {
+            boxes.push(Aabb::new(Vec3A::ZERO, Vec3A::splat(size)));
+            size *= grow;
+        }
+        let tree = body::tree(&mut boxes, &body::TOP);
+        assert!(
+            tree.depth(0) <= 96,
+            "{} levels for {} boxes",
+            tree.depth(0),
+            boxes.len()
+        );
+        let mut held = tree.primitive_indices.clone();
+        held.sort_unstable();
+        assert!(held.into_iter().eq(0..boxes.len() as u32), "each box once");
     }
 }
 
