@@ -396,8 +396,11 @@ impl CpuTracer {
         let corner = (origin - self.bounds.min)
             .abs()
             .max((origin - self.bounds.max).abs());
+        let farthest = corner.length() * 1.01;
+        // Not min(), which would take a NaN for no limit.
+        let t_max = if t_max > farthest { farthest } else { t_max };
         if origin.is_finite() {
-            Span::new(t_max.min(corner.length() * 1.01))
+            Span::new(t_max)
         } else {
             None
         }
