@@ -2,6 +2,7 @@
 
 pub mod camera;
 pub mod encode;
+pub mod identity;
 pub mod metrics;
 pub mod picture;
 pub mod points;
@@ -10,5 +11,6 @@ pub mod render;
 pub mod report;
 pub mod samples;
 pub mod scene;
+pub mod transport;
 pub mod truth;
 pub mod world;
