@@ -1,6 +1,8 @@
 //! The PSAO reference server: `scene ─► points ─► occlusion ─► select ─► encode ─► transport`.
 
+pub mod args;
 pub mod camera;
+pub mod demo;
 pub mod encode;
 pub mod identity;
 pub mod metrics;
@@ -11,6 +13,7 @@ pub mod render;
 pub mod report;
 pub mod samples;
 pub mod scene;
+pub mod server;
 pub mod transport;
 pub mod truth;
 pub mod world;

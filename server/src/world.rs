@@ -605,7 +605,7 @@ impl World {
             slice.stale = false;
             let (first, words) = (slice.points.start as usize, all.div_ceil(64));
             stats.rays += traced.rays;
-            stats.points += traced.occlusion.len() as u64;
+            stats.points += traced.points;
             let bits = first * words..first * words + traced.fixed.len();
             self.fixed[bits].copy_from_slice(&traced.fixed);
             for (point, &occlusion) in (first..).zip(&traced.occlusion) {
@@ -647,36 +647,39 @@ impl World {
             let position = pose.world_from_local.transform_point3(local);
             let normal = pose.world_normal(point.normal(triangles, positions, normals));
             let outward = pose.world_normal(point.geometric_normal(triangles, positions));
-            let tangent = point.tangent(triangles, positions);
-            let tangent = pose.world_from_local.transform_vector3(tangent);
             let origin = offset_origin(position, outward, reach);
-            self.samples
-                .directions(number, normal, tangent, &mut directions);
-
+            let converging = rays > slice.rays_done;
+            let others_near = others != Against::Movers
+                || movers
+                    .iter()
+                    .any(|mover| can_reach(*mover, origin, normal, t_max));
+            if converging || others_near {
+                let tangent = point.tangent(triangles, positions);
+                let tangent = pose.world_from_local.transform_vector3(tangent);
+                self.samples
+                    .directions(number, normal, tangent, &mut directions);
+                traced.points += 1;
+            }
             hit.fill(0);
             if let Some(attached) = attached {
                 let bits = number as usize * words;
                 hit.copy_from_slice(&self.fixed[bits..bits + words]);
-                if rays > slice.rays_done {
+                if converging {
                     set_bits(&mut todo, slice.rays_done..rays);
                     self.tracer
                         .occluded(attached, origin, &directions, t_max, &todo, &mut hit);
                     traced.rays += (rays - slice.rays_done) as u64;
+                    traced.fixed.extend_from_slice(&hit);
                 }
-                traced.fixed.extend_from_slice(&hit);
             }
-            set_bits(&mut todo, 0..rays);
-            // A ray that hit what the point is attached to needs no other, and without a mover
-            // within reach none is needed.
-            let open = rays as u64 - count(&hit);
-            let reached = |mover: &[Vec3; 2]| touches(*mover, [origin; 2], t_max);
-            if others != Against::Movers || movers.iter().any(reached) {
+            if others_near {
+                // A ray that hit what the point is attached to needs no other.
+                traced.rays += rays as u64 - count(&hit);
+                set_bits(&mut todo, 0..rays);
                 self.tracer
                     .occluded(others, origin, &directions, t_max, &todo, &mut hit);
-                traced.rays += open;
             }
-            let blocked = count(&hit);
-            let open = 255.0 * (1.0 - blocked as f32 / rays as f32);
+            let open = 255.0 * (1.0 - count(&hit) as f32 / rays as f32);
             traced.occlusion.push((open + 0.5) as u8);
         }
         traced
@@ -796,8 +799,17 @@ impl std::error::Error for NoInstance {}
 #[derive(Default)]
 struct Traced {
     occlusion: Vec<u8>,
+    /// Empty unless the slice gained rays.
     fixed: Vec<u64>,
     rays: u64,
+    points: u64,
+}
+
+/// Whether a ray from `origin` into the hemisphere around `normal` can meet a box within `t_max`.
+fn can_reach([min, max]: [Vec3; 2], origin: Vec3, normal: Vec3, t_max: f32) -> bool {
+    let near = origin.clamp(min, max).distance_squared(origin) <= t_max * t_max;
+    let (center, half) = ((min + max) * 0.5, (max - min) * 0.5);
+    near && normal.dot(center - origin) + normal.abs().dot(half) > 0.0
 }
 
 fn set_bits(words: &mut [u64], bits: Range<usize>) {

@@ -1,0 +1,186 @@
+//! Options that several commands share: which scene, how sampled, how sent.
+
+use crate::camera::CameraPath;
+use crate::encode::Compression;
+use crate::points::SurfacePoint;
+use crate::scene::{Placement, Scene};
+use crate::server::Settings;
+use crate::world::{Options, Progress, World};
+use clap::{Args, ValueEnum};
+use glam::Vec3;
+use psao_core::Kernel;
+use std::path::PathBuf;
+
+/// Which scene, and how it is sampled.
+#[derive(Args, Clone, Debug)]
+pub struct SceneArgs {
+    /// A glTF file (.gltf or .glb); without it, a built-in atrium with moving boulders and figures
+    #[arg(long, value_name = "FILE")]
+    pub scene: Option<PathBuf>,
+    /// Places another file in the scene, at metres x,y,z, scaled; may be given several times
+    #[arg(long, value_name = "FILE@X,Y,Z[,SCALE]")]
+    pub add: Vec<Placement>,
+    /// Adds boulders that roll through the middle of the scene
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub movers: usize,
+    /// Metres per unit of the scene's files
+    #[arg(long, value_name = "METRES", default_value_t = 1.0)]
+    pub unit: f64,
+    /// Points per square metre and side
+    #[arg(long, value_name = "N", default_value_t = 512.0)]
+    pub density: f64,
+    /// Rays a point, 1 to 4096
+    #[arg(long, value_name = "N", default_value_t = 256)]
+    pub rays: usize,
+    /// Longest ray, metres
+    #[arg(long, value_name = "METRES", default_value_t = 0.6)]
+    pub ao_distance: f32,
+    /// How a fragment blends the points around it; decides radius and cell size
+    #[arg(long, value_enum, default_value_t = KernelArg::Planar)]
+    pub kernel: KernelArg,
+    /// Seed of the point placement and of the boulders
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    pub seed: u64,
+}
+
+/// A kernel by name.
+#[derive(ValueEnum, Clone, Copy, Debug, PartialEq, Eq)]
+pub enum KernelArg {
+    /// The default of this project
+    Planar,
+    /// Eq. 2 to 4 of the paper
+    Paper,
+}
+
+/// Compression by name.
+#[derive(ValueEnum, Clone, Copy, Debug, PartialEq, Eq)]
+pub enum CompressionArg {
+    /// zstd level 1
+    Fast,
+    /// zstd level 15, strategy 4, as in the paper
+    Paper,
+}
+
+/// How it is sent.
+#[derive(Args, Clone, Debug)]
+pub struct StreamArgs {
+    /// Server frames per second
+    #[arg(long, value_name = "HZ", default_value_t = 30.0)]
+    pub fps: f32,
+    /// Occlusion differences up to this many 1/255 are not sent
+    #[arg(long, value_name = "N", default_value_t = 2)]
+    pub threshold: u8,
+    /// How hard zstd tries
+    #[arg(long, value_enum, default_value_t = CompressionArg::Fast)]
+    pub compression: CompressionArg,
+    /// The extended field of view reaches this much farther on every side, degrees
+    #[arg(long, value_name = "DEGREES", default_value_t = 10.0)]
+    pub margin: f32,
+}
+
+impl SceneArgs {
+    /// Loads the scene with all its additions.
+    ///
+    /// # Errors
+    /// What is wrong with a file or an option, and what to do.
+    pub fn load(&self) -> Result<Scene, String> {
+        let usable = self.unit.is_finite() && self.unit > 0.0;
+        usable
+            .then_some(())
+            .ok_or("--unit must be above 0: metres per unit of the files")?;
+        let mut scene = match &self.scene {
+            Some(path) => Scene::load(path, self.unit).map_err(|e| e.to_string())?,
+            None => Scene::atrium(),
+        };
+        for placement in &self.add {
+            let other = Scene::load(&placement.path, self.unit).map_err(|e| e.to_string())?;
+            scene.add(other, placement.at, placement.scale);
+        }
+        if self.movers > 0 {
+            scene.add_movers(self.movers, self.seed);
+        }
+        Ok(scene)
+    }
+
+    /// How the scene is to be sampled.
+    ///
+    /// # Errors
+    /// An option is out of its range.
+    pub fn options(&self) -> Result<Options, String> {
+        if !(1..=crate::samples::MAX_RAYS).contains(&self.rays) {
+            return Err(format!("--rays must be 1 to {}", crate::samples::MAX_RAYS));
+        }
+        // An infinite distance is allowed: the scene's size bounds the rays.
+        if self.ao_distance.is_nan() || self.ao_distance < 0.0 {
+            return Err("--ao-distance must be 0 or more metres".into());
+        }
+        let kernel = match self.kernel {
+            KernelArg::Planar => Kernel::Planar,
+            KernelArg::Paper => Kernel::Paper,
+        };
+        Ok(Options {
+            density: self.density,
+            rays: self.rays,
+            ao_distance_m: self.ao_distance,
+            seed: self.seed,
+            ..Options::of(kernel)
+        })
+    }
+
+    /// Loads the scene and places its points.
+    ///
+    /// # Errors
+    /// What is wrong with a file or an option, and what to do.
+    pub fn world(&self, progress: Progress<'_>) -> Result<World, String> {
+        let options = self.options()?;
+        World::new(self.load()?, options, progress).map_err(|error| error.to_string())
+    }
+}
+
+impl StreamArgs {
+    /// How frames are made.
+    ///
+    /// # Errors
+    /// An option is out of its range.
+    pub fn settings(&self) -> Result<Settings, String> {
+        if !(self.fps > 0.0 && self.fps <= 1000.0) {
+            return Err("--fps must be above 0 and at most 1000".into());
+        }
+        if !(0.0..=180.0).contains(&self.margin) {
+            return Err("--margin must be 0 to 180 degrees".into());
+        }
+        Ok(Settings {
+            threshold: self.threshold,
+            compression: match self.compression {
+                CompressionArg::Fast => Compression::Fast,
+                CompressionArg::Paper => Compression::Paper,
+            },
+            rate_hz: self.fps,
+            margin_rad: self.margin.to_radians(),
+        })
+    }
+}
+
+/// A camera path through a world; `which` is 0 or 1.
+///
+/// # Errors
+/// The scene has no extent.
+pub fn camera_path(world: &World, which: u32, aspect: f32) -> Result<CameraPath, String> {
+    let closest = |origin: Vec3, direction: Vec3| {
+        let hit = world.tracer().closest(origin, direction, f32::INFINITY)?;
+        let instance = &world.scene.instances[hit.instance as usize];
+        let mesh = &world.scene.meshes[instance.mesh as usize];
+        let point = SurfacePoint {
+            triangle: hit.triangle,
+            u: hit.u,
+            v: hit.v,
+            back: false,
+        };
+        let local = point.geometric_normal(&mesh.triangles, world.vertices(hit.instance).0);
+        let normal = world.pose.instances[hit.instance as usize].world_normal(local);
+        // Both sides of what has two are fronts.
+        let away = mesh.double_sided && normal.dot(direction) > 0.0;
+        Some((hit.t, if away { -normal } else { normal }))
+    };
+    CameraPath::find(world.scene.bounds(&world.pose), which, aspect, &closest)
+}
