@@ -2,6 +2,7 @@
 
 pub mod args;
 pub mod camera;
+pub mod commands;
 pub mod demo;
 pub mod encode;
 pub mod identity;

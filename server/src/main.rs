@@ -2,6 +2,7 @@
 
 use clap::{Parser, Subcommand};
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
+use psao_server::commands::{self, InspectArgs, PlayArgs, RecordArgs, ServeArgs};
 use psao_server::demo::{self, DemoArgs};
 use std::collections::HashMap;
 use std::process::ExitCode;
@@ -18,7 +19,15 @@ struct Cli {
 #[derive(Subcommand)]
 enum Command {
     /// Streams a moving scene from a server to a client on this machine, and reports on it
-    Demo(DemoArgs),
+    Demo(Box<DemoArgs>),
+    /// Serves a scene to clients over QUIC
+    Serve(Box<ServeArgs>),
+    /// Records a scene's stream to a file
+    Record(Box<RecordArgs>),
+    /// Follows a recording or a live server, and checks it
+    Play(PlayArgs),
+    /// Lists what is in a recording
+    Inspect(InspectArgs),
 }
 
 fn main() -> ExitCode {
@@ -33,11 +42,16 @@ fn main() -> ExitCode {
         Command::Demo(args) => demo::run(args, &progress).map(|figures| {
             bars.finish();
             print_table(&figures.table());
-            println!(
-                "\nReport and pictures: {}",
-                args.out.join("report.html").display()
-            );
+            let report = args.out.join("report.html");
+            println!("\nReport and pictures: {}", report.display());
         }),
+        Command::Serve(args) => commands::serve(args, &progress),
+        Command::Record(args) => commands::record(args, &progress).map(|bytes| {
+            bars.finish();
+            println!("{}: {bytes} bytes", args.out.display());
+        }),
+        Command::Play(args) => commands::play(args).map(|table| print_table(&table)),
+        Command::Inspect(args) => commands::inspect(args, &mut std::io::stdout().lock()),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,

@@ -101,6 +101,14 @@ impl Samples {
             out.len(),
             self.rays
         );
+        let set = self.of_point(point_id, normal, tangent);
+        for (index, out) in out.iter_mut().enumerate() {
+            *out = set.direction(index);
+        }
+    }
+
+    /// The set of a point, as in [`Samples::directions`], to take single directions from.
+    pub fn of_point(&self, point_id: u32, normal: Vec3, tangent: Vec3) -> PointSamples<'_> {
         let bits = hash(point_id);
         let normal = scaled(normal)
             .and_then(Vec3::try_normalize)
@@ -116,15 +124,38 @@ impl Samples {
         };
         let y = normal.cross(x);
         let (sin, cos) = (unit(bits) * TAU).sin_cos();
-        let (x, y) = (
-            Vec3A::from(x * cos + y * sin),
-            Vec3A::from(y * cos - x * sin),
-        );
-        let z = Vec3A::from(normal);
         // The low bits choose the set; the rotation comes from the high ones.
         let first = bits as usize % SETS * self.rays;
-        for (out, d) in out.iter_mut().zip(&self.directions[first..]) {
-            *out = (x * d.x + y * d.y + z * d.z).into();
+        PointSamples {
+            axes: [x * cos + y * sin, y * cos - x * sin, normal].map(Vec3A::from),
+            local: &self.directions[first..first + self.rays],
+        }
+    }
+}
+
+/// The directions of one point.
+pub struct PointSamples<'a> {
+    axes: [Vec3A; 3],
+    /// Around z.
+    local: &'a [Vec3],
+}
+
+impl PointSamples<'_> {
+    /// Direction `index` in the world.
+    pub fn direction(&self, index: usize) -> Vec3 {
+        let d = self.local[index];
+        let [x, y, z] = self.axes;
+        (x * d.x + y * d.y + z * d.z).into()
+    }
+
+    /// Sets the bits of those of the first `count` directions that are within a cone: whose dot
+    /// product with the unit `axis` is at least `cos`.
+    pub fn within_cone(&self, axis: Vec3, cos: f32, count: usize, bits: &mut [u64]) {
+        let local = Vec3::from(self.axes.map(|own| own.dot(Vec3A::from(axis))));
+        for (word, directions) in bits.iter_mut().zip(self.local[..count].chunks(64)) {
+            for (bit, direction) in directions.iter().enumerate() {
+                *word |= u64::from(direction.dot(local) >= cos) << bit;
+            }
         }
     }
 }

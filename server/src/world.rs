@@ -7,7 +7,7 @@
 
 use crate::points::{PointError, SurfacePoint, generate, largest_radius, morton_order};
 use crate::rays::{Against, CpuTracer, Deformed, TooManyTriangles, Tracer, offset_origin, reach};
-use crate::samples::Samples;
+use crate::samples::{PointSamples, Samples};
 use crate::scene::{InstancePose, Mesh, Pose, Scene};
 use crate::truth::{Place, Placement, Truth, buckets_for, fit};
 use glam::{Affine3A, DAffine3, Vec3, Vec3A};
@@ -641,6 +641,10 @@ impl World {
         let mut directions = vec![Vec3::ZERO; rays];
         let mut todo = vec![0u64; words];
         let mut hit = vec![0u64; words];
+        let attached_hits = |number: u32| {
+            let first = number as usize * words;
+            &self.fixed[first..first + words]
+        };
         for number in slice.points.clone() {
             let point = &self.points[number as usize];
             let local = point.position(triangles, positions);
@@ -649,38 +653,43 @@ impl World {
             let outward = pose.world_normal(point.geometric_normal(triangles, positions));
             let origin = offset_origin(position, outward, reach);
             let converging = rays > slice.rays_done;
-            let others_near = others != Against::Movers
-                || movers
-                    .iter()
-                    .any(|mover| can_reach(*mover, origin, normal, t_max));
-            if converging || others_near {
-                let tangent = point.tangent(triangles, positions);
-                let tangent = pose.world_from_local.transform_vector3(tangent);
-                self.samples
-                    .directions(number, normal, tangent, &mut directions);
-                traced.points += 1;
+            let reached = |mover: &&[Vec3; 2]| can_reach(**mover, origin, normal, t_max);
+            let others_near = others != Against::Movers || movers.iter().any(|m| reached(&m));
+            if !converging && !others_near {
+                traced.push(attached_hits(number), rays);
+                continue;
             }
+            let tangent = point.tangent(triangles, positions);
+            let tangent = pose.world_from_local.transform_vector3(tangent);
+            let samples = self.samples.of_point(number, normal, tangent);
+            traced.points += 1;
             hit.fill(0);
             if let Some(attached) = attached {
-                let bits = number as usize * words;
-                hit.copy_from_slice(&self.fixed[bits..bits + words]);
+                hit.copy_from_slice(attached_hits(number));
                 if converging {
                     set_bits(&mut todo, slice.rays_done..rays);
+                    traced.rays += take(&samples, &todo, &hit, &mut directions);
                     self.tracer
                         .occluded(attached, origin, &directions, t_max, &todo, &mut hit);
-                    traced.rays += (rays - slice.rays_done) as u64;
                     traced.fixed.extend_from_slice(&hit);
                 }
             }
             if others_near {
-                // A ray that hit what the point is attached to needs no other.
-                traced.rays += rays as u64 - count(&hit);
-                set_bits(&mut todo, 0..rays);
+                // A ray that hit what the point is attached to needs no other; nor, where only
+                // movers are left, does one that leaves beside all of them.
+                if others == Against::Movers {
+                    todo.fill(0);
+                    for mover in movers.iter().filter(reached) {
+                        mark_towards(*mover, origin, &samples, rays, &mut todo);
+                    }
+                } else {
+                    set_bits(&mut todo, 0..rays);
+                }
+                traced.rays += take(&samples, &todo, &hit, &mut directions);
                 self.tracer
                     .occluded(others, origin, &directions, t_max, &todo, &mut hit);
             }
-            let open = 255.0 * (1.0 - count(&hit) as f32 / rays as f32);
-            traced.occlusion.push((open + 0.5) as u8);
+            traced.push(&hit, rays);
         }
         traced
     }
@@ -810,6 +819,48 @@ fn can_reach([min, max]: [Vec3; 2], origin: Vec3, normal: Vec3, t_max: f32) -> b
     let near = origin.clamp(min, max).distance_squared(origin) <= t_max * t_max;
     let (center, half) = ((min + max) * 0.5, (max - min) * 0.5);
     near && normal.dot(center - origin) + normal.abs().dot(half) > 0.0
+}
+
+impl Traced {
+    fn push(&mut self, hit: &[u64], rays: usize) {
+        let open = 255.0 * (1.0 - count(hit) as f32 / rays as f32);
+        self.occlusion.push((open + 0.5) as u8);
+    }
+}
+
+/// Makes the directions that are asked for and not known to hit, and counts them.
+fn take(samples: &PointSamples, todo: &[u64], hit: &[u64], directions: &mut [Vec3]) -> u64 {
+    let mut rays = 0;
+    for (word, (todo, hit)) in todo.iter().zip(hit).enumerate() {
+        let mut rest = todo & !hit;
+        rays += u64::from(rest.count_ones());
+        while rest != 0 {
+            let index = word * 64 + rest.trailing_zeros() as usize;
+            directions[index] = samples.direction(index);
+            rest &= rest - 1;
+        }
+    }
+    rays
+}
+
+/// Marks the rays that can meet the ball around a box.
+fn mark_towards(
+    [min, max]: [Vec3; 2],
+    origin: Vec3,
+    samples: &PointSamples,
+    rays: usize,
+    todo: &mut [u64],
+) {
+    let to = (min + max) * 0.5 - origin;
+    let radius_squared = (max - min).length_squared() * 0.25;
+    let sin_squared = radius_squared / to.length_squared();
+    if sin_squared < 1.0 {
+        // A little wider, for rounding.
+        let cos = (1.0 - sin_squared).sqrt() - 1e-4;
+        samples.within_cone(to.normalize(), cos, rays, todo);
+    } else {
+        set_bits(todo, 0..rays);
+    }
 }
 
 fn set_bits(words: &mut [u64], bits: Range<usize>) {

@@ -1,0 +1,425 @@
+//! `psao serve`, `record`, `play` and `inspect`.
+
+use crate::args::{SceneArgs, StreamArgs, camera_path};
+use crate::camera::Frustum;
+use crate::encode::{Encoder, capacity_of};
+use crate::identity::Identity;
+use crate::server::Server;
+use crate::transport::{Transport, TransportConfig};
+use crate::world::Progress;
+use clap::Args;
+use glam::Vec3;
+use psao::quic::{Closed, Connect, Connection, Trust};
+use psao::{Client, Config, State};
+use psao_core::mirror::Capacity;
+use psao_core::stream::{
+    Frame, Header, MAX_BODY_BYTES, PREAMBLE, Packet, Refusal, StreamError, flag, kind,
+};
+use std::fs::File;
+use std::io::{BufReader, BufWriter, Read, Write};
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+/// Options of `psao serve`.
+#[derive(Args, Clone, Debug)]
+pub struct ServeArgs {
+    /// The scene.
+    #[command(flatten)]
+    pub scene: SceneArgs,
+    /// The stream.
+    #[command(flatten)]
+    pub stream: StreamArgs,
+    /// Address and UDP port to listen on
+    #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:4433")]
+    pub listen: SocketAddr,
+    /// What clients must present
+    #[arg(long, env = "PSAO_TOKEN", hide_env_values = true)]
+    pub token: String,
+    /// Folder of the server's certificate and key; made on first use
+    #[arg(long, value_name = "DIR", default_value = "psao-identity")]
+    pub identity: PathBuf,
+    /// Clients served at once
+    #[arg(long, value_name = "N", default_value_t = 8)]
+    pub max_clients: usize,
+    /// Stops after this many frames; without it, runs until it is ended
+    #[arg(long, value_name = "N")]
+    pub frames: Option<u64>,
+}
+
+/// Options of `psao record`.
+#[derive(Args, Clone, Debug)]
+pub struct RecordArgs {
+    /// The scene.
+    #[command(flatten)]
+    pub scene: SceneArgs,
+    /// The stream.
+    #[command(flatten)]
+    pub stream: StreamArgs,
+    /// The recording to write
+    #[arg(value_name = "FILE.psao")]
+    pub out: PathBuf,
+    /// Frames to record
+    #[arg(long, value_name = "N", default_value_t = 60)]
+    pub frames: u32,
+    /// Which of the two camera paths to walk, 0 or 1; without it, everything is in view
+    #[arg(long, value_name = "N")]
+    pub path: Option<u32>,
+}
+
+/// Options of `psao play`.
+#[derive(Args, Clone, Debug)]
+pub struct PlayArgs {
+    /// A recording; or with --fingerprint, a server's address
+    #[arg(value_name = "FILE.psao | HOST:PORT")]
+    pub source: String,
+    /// Fingerprint of the server's certificate, as `psao serve` prints it
+    #[arg(long, value_name = "HEX")]
+    pub fingerprint: Option<psao::quic::Fingerprint>,
+    /// The server's token
+    #[arg(long, env = "PSAO_TOKEN", hide_env_values = true, default_value = "")]
+    pub token: String,
+    /// Largest memory of the client's buffers, MiB
+    #[arg(long, value_name = "MIB", default_value_t = 2048)]
+    pub max_memory: u64,
+    /// Stops after this many frames
+    #[arg(long, value_name = "N")]
+    pub frames: Option<u64>,
+}
+
+/// Options of `psao inspect`.
+#[derive(Args, Clone, Debug)]
+pub struct InspectArgs {
+    /// A recording
+    #[arg(value_name = "FILE.psao")]
+    pub file: PathBuf,
+}
+
+/// Runs a server.
+///
+/// # Errors
+/// What went wrong, and what to do about it.
+pub fn serve(args: &ServeArgs, progress: Progress<'_>) -> Result<(), String> {
+    let settings = args.stream.settings()?;
+    let identity = Identity::load_or_create(&args.identity).map_err(|e| e.to_string())?;
+    let fingerprint = identity.fingerprint();
+    let world = args.scene.world(progress)?;
+    let mut server = Server::new(world, settings);
+    let mut transport = Transport::start(TransportConfig {
+        listen: args.listen,
+        identity,
+        token: args.token.clone(),
+        max_clients: args.max_clients,
+        scene_hash: server.scene_hash(),
+        capacity: capacity_of(&server.world.truth),
+    })
+    .map_err(|error| error.to_string())?;
+    println!("listening    {}", transport.local_addr());
+    println!("fingerprint  {fingerprint}");
+    println!("scene hash   {:016x}", server.scene_hash());
+
+    let period = Duration::from_secs_f32(1.0 / settings.rate_hz);
+    let start = Instant::now();
+    let mut next = start;
+    // New surfaces converge with what time the frame leaves.
+    let mut converge_rays = 1u64 << 20;
+    let mut frames = 0;
+    while args.frames.is_none_or(|last| frames < last) {
+        let began = Instant::now();
+        server.frame(&mut transport, (began - start).as_secs_f64(), converge_rays);
+        let busy = began.elapsed();
+        let fits = busy < period.mul_f32(0.8);
+        converge_rays = if fits {
+            converge_rays / 4 * 5
+        } else {
+            converge_rays / 2
+        };
+        converge_rays = converge_rays.clamp(1 << 17, 1 << 30);
+        frames += 1;
+        next = (next + period).max(Instant::now());
+        std::thread::sleep(next - Instant::now().min(next));
+    }
+    transport.close();
+    Ok(())
+}
+
+/// Records a scene's stream to a file, without a network. The file appears whole or not at all.
+///
+/// # Errors
+/// What went wrong, and what to do about it.
+pub fn record(args: &RecordArgs, progress: Progress<'_>) -> Result<u64, String> {
+    let settings = args.stream.settings()?;
+    let mut world = args.scene.world(progress)?;
+    let path = args
+        .path
+        .map(|which| camera_path(&world, which, 16.0 / 9.0))
+        .transpose()?;
+    let time_of = |frame: u32| f64::from(frame) / f64::from(settings.rate_hz);
+    let view = |time: f64| {
+        path.as_ref()
+            .map(|path| Frustum::new(&path.at(time), settings.margin_rad))
+    };
+    let first = view(0.0);
+    world.converge(&|bounds| sees(&first, bounds), progress);
+
+    let error = |error: std::io::Error| format!("{}: {error}", args.out.display());
+    let temporary = args.out.with_extension("psao.part");
+    let mut file = BufWriter::new(File::create(&temporary).map_err(error)?);
+    let mut encoder = Encoder::new(&world.truth, settings.threshold, settings.compression);
+    let scene_hash = world.scene.hash();
+    let mut bytes = encoder.header(&world, scene_hash, settings.rate_hz);
+    let mut total = 0;
+    for frame in 0..args.frames {
+        let time = time_of(frame);
+        let view = view(time);
+        let visible = |bounds: [Vec3; 2]| sees(&view, bounds);
+        world.step(time, &visible, u64::MAX);
+        encoder.merge(&world.truth);
+        world.truth.clear_changes();
+        encoder.frame(&world, (time * 1e9) as u64, &visible, true, &mut bytes);
+        if frame + 1 == args.frames {
+            encoder.end(&mut bytes);
+        }
+        file.write_all(&bytes).map_err(error)?;
+        total += bytes.len() as u64;
+        bytes.clear();
+        progress("frames", u64::from(frame) + 1, u64::from(args.frames));
+    }
+    let file = file.into_inner().map_err(|e| error(e.into_error()))?;
+    file.sync_all().map_err(error)?;
+    std::fs::rename(&temporary, &args.out).map_err(error)?;
+    Ok(total)
+}
+
+fn sees(frustum: &Option<Frustum>, [min, max]: [Vec3; 2]) -> bool {
+    frustum
+        .as_ref()
+        .is_none_or(|frustum| frustum.sees_box(min, max))
+}
+
+/// What a client made of a stream: what, and its value.
+pub type Table = Vec<(String, String)>;
+
+/// Follows a recording, or a live server.
+///
+/// # Errors
+/// What went wrong, and what to do about it.
+pub fn play(args: &PlayArgs) -> Result<Table, String> {
+    // Half for cells, a quarter for buckets; the rest is dirty sets and instances.
+    let half = (args.max_memory.min(1 << 20) << 20) / 2 / 32;
+    let elements = u32::try_from(half).unwrap_or(u32::MAX);
+    let capacity = Capacity {
+        instances: 1 << 20,
+        buckets: elements / 2,
+        cells: elements,
+    };
+    let mut player = Player {
+        client: Client::new(Config {
+            capacity,
+            scene_hash: 0,
+        }),
+        first_ns: 0,
+        last: Frame::default(),
+        decode: Vec::new(),
+    };
+    match &args.fingerprint {
+        None => player.file(Path::new(&args.source), args.frames)?,
+        Some(fingerprint) => player.live(args, *fingerprint, capacity)?,
+    }
+    Ok(player.table())
+}
+
+struct Player {
+    client: Client,
+    first_ns: u64,
+    last: Frame,
+    /// Milliseconds of decoding a frame.
+    decode: Vec<f64>,
+}
+
+impl Player {
+    fn file(&mut self, path: &Path, frames: Option<u64>) -> Result<(), String> {
+        let error = |error: &dyn std::fmt::Display| format!("{}: {error}", path.display());
+        let mut file = BufReader::new(File::open(path).map_err(|e| error(&e))?);
+        let mut chunk = vec![0; 1 << 16];
+        while self.wants_more(frames) {
+            let count = file.read(&mut chunk).map_err(|e| error(&e))?;
+            if count == 0 {
+                break;
+            }
+            self.push(&chunk[..count], |_| ()).map_err(|e| error(&e))?;
+        }
+        if self.client.state() != State::Ended && frames.is_none() {
+            return Err(error(
+                &"the recording breaks off: it was not written to its end",
+            ));
+        }
+        Ok(())
+    }
+
+    fn live(
+        &mut self,
+        args: &PlayArgs,
+        fingerprint: psao::quic::Fingerprint,
+        capacity: Capacity,
+    ) -> Result<(), String> {
+        let mut connection = Connection::open(Connect {
+            address: &args.source,
+            server_name: None,
+            token: &args.token,
+            trust: Trust::Fingerprint(fingerprint),
+            scene_hash: 0,
+            capacity,
+        })
+        .map_err(|error| error.to_string())?;
+        let mut received = Vec::new();
+        while self.wants_more(args.frames) {
+            received.clear();
+            match connection.receive_timeout(&mut received, Duration::from_secs(1)) {
+                Ok(_) => {}
+                Err(Closed::Ended) => break,
+                Err(closed) => return Err(closed.to_string()),
+            }
+            // A lost acknowledgement is made up for by the next.
+            self.push(&received, |frame| {
+                let _ = connection.ack(frame.id);
+            })?;
+            if self.client.state() == State::Desynchronised && self.client.stats().frames > 0 {
+                connection.resync().map_err(|error| error.to_string())?;
+            }
+        }
+        connection.close();
+        Ok(())
+    }
+
+    fn wants_more(&self, frames: Option<u64>) -> bool {
+        self.client.state() != State::Ended
+            && frames.is_none_or(|frames| self.client.stats().frames < frames)
+    }
+
+    fn push(&mut self, bytes: &[u8], completed: impl Fn(&Frame)) -> Result<(), String> {
+        let mut rest = bytes;
+        let mut start = Instant::now();
+        while !rest.is_empty() {
+            let pushed = self.client.push(rest).map_err(|error| error.to_string())?;
+            rest = &rest[pushed.consumed..];
+            if let Some(frame) = pushed.frame {
+                if self.client.stats().frames == 1 {
+                    self.first_ns = frame.time_ns;
+                }
+                self.decode.push(start.elapsed().as_secs_f64() * 1e3);
+                self.last = frame;
+                self.client.clear_dirty();
+                completed(&frame);
+                start = Instant::now();
+            }
+        }
+        Ok(())
+    }
+
+    fn table(mut self) -> Table {
+        let stats = self.client.stats();
+        let seconds = self.last.time_ns.saturating_sub(self.first_ns) as f64 / 1e9;
+        self.decode.sort_by(f64::total_cmp);
+        let decode = self
+            .decode
+            .get(self.decode.len() / 2)
+            .copied()
+            .unwrap_or(0.0);
+        let row = |what: &str, value: String| (what.to_string(), value);
+        vec![
+            row(
+                "frames",
+                format!("{} ({} snapshots)", stats.frames, stats.snapshots),
+            ),
+            row("scene time", format!("{seconds:.2} s")),
+            row("bytes", stats.bytes.to_string()),
+            row(
+                "changes",
+                format!(
+                    "{} cells, {} buckets, {} instances",
+                    stats.cells, stats.buckets, stats.instances
+                ),
+            ),
+            row(
+                "mirror hash",
+                format!("{:016x}", self.client.mirror().hash()),
+            ),
+            row("hash mismatches", stats.mismatches.to_string()),
+            row("decoding", format!("{decode:.3} ms a frame (median)")),
+            row(
+                "client's memory",
+                format!("{:.1} MB", self.client.memory_bytes() as f64 / 1e6),
+            ),
+        ]
+    }
+}
+
+/// Prints what is in a recording, a line a frame.
+///
+/// # Errors
+/// The file is no recording, or is damaged (where).
+pub fn inspect(args: &InspectArgs, out: &mut dyn Write) -> Result<(), String> {
+    let name = args.file.display();
+    let bytes = std::fs::read(&args.file).map_err(|error| format!("{name}: {error}"))?;
+    let at = |rest: &[u8]| bytes.len() - rest.len();
+    let fail = |rest: &[u8], error: &dyn std::fmt::Display| {
+        format!("{name}: at byte {}: {error}", at(rest))
+    };
+    let mut rest = bytes
+        .strip_prefix(&PREAMBLE)
+        .ok_or_else(|| fail(&bytes, &StreamError::NotAStream))?;
+    let print = |out: &mut dyn Write, line: String| {
+        writeln!(out, "{line}").map_err(|error| format!("standard output: {error}"))
+    };
+    let (mut packets, mut frame_bytes) = (0, 0);
+    while !rest.is_empty() {
+        let read = Packet::read(rest, MAX_BODY_BYTES).map_err(|error| fail(rest, &error))?;
+        let Some((packet, length)) = read else {
+            return Err(fail(rest, &"the recording breaks off"));
+        };
+        match packet.kind {
+            kind::HEADER => {
+                let header = Header::read(packet.body).map_err(|error| fail(rest, &error))?;
+                print(out, format!("{header:#?}"))?;
+                print(
+                    out,
+                    "frame      time s  packets     bytes  mirror hash".into(),
+                )?;
+            }
+            kind::FRAME => {
+                let (frame, _) = Frame::read(packet.body).map_err(|error| fail(rest, &error))?;
+                packets += 1;
+                frame_bytes += length;
+                if packet.flags & flag::LAST != 0 {
+                    let Frame {
+                        id,
+                        time_ns,
+                        mirror_hash,
+                        ..
+                    } = frame;
+                    let seconds = time_ns as f64 / 1e9;
+                    let line = format!(
+                        "{id:>5}  {seconds:>10.4}  {packets:>7}  {frame_bytes:>8}  {mirror_hash:016x}"
+                    );
+                    print(out, line)?;
+                    (packets, frame_bytes) = (0, 0);
+                }
+            }
+            kind::END => print(out, "end".into())?,
+            kind::REFUSE => {
+                let code = packet
+                    .body
+                    .first_chunk()
+                    .map_or(0, |code| u16::from_le_bytes(*code));
+                print(out, format!("refused: {:?}", Refusal::from_code(code)))?;
+            }
+            other => print(
+                out,
+                format!("packet of unknown kind {other}, {length} bytes"),
+            )?,
+        }
+        rest = &rest[length..];
+    }
+    Ok(())
+}
