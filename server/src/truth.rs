@@ -90,6 +90,41 @@ pub fn buckets_for(cells: usize) -> u32 {
     ((4 * cells).div_ceil(BUCKET_ENTRIES) as u32).max(1) | 1
 }
 
+/// The best bucket count up to `most` (odd) for an instance's cells.
+///
+/// Eq. 1 is linear, so for some counts whole rows of cells fall into few buckets (17·Dx and
+/// 31·Dx·Dy may be small multiples of one another modulo the count); a few less, and they don't.
+pub fn choose_buckets(grid: &Instance, cells: &[[u32; 3]], most: u32) -> u32 {
+    let mut best = (u64::MAX, most);
+    for count in (0..16)
+        .map(|i| most.saturating_sub(2 * i))
+        .filter(|&count| count > 0)
+    {
+        let candidate = Instance {
+            bucket_first: 0,
+            bucket_count: count,
+            ..*grid
+        };
+        let mut load = vec![0u32; count as usize];
+        cells
+            .iter()
+            .for_each(|&cell| load[candidate.bucket(cell) as usize] += 1);
+        // What overflows counts most; what is more than half full leaves no room to move.
+        let cost = |&load: &u32| -> u64 {
+            u64::from(load.saturating_sub(BUCKET_ENTRIES as u32 / 2)).pow(2)
+                + 1000 * u64::from(load.saturating_sub(BUCKET_ENTRIES as u32))
+        };
+        let cost = load.iter().map(cost).sum();
+        if cost < best.0 {
+            best = (cost, count);
+        }
+        if cost == 0 {
+            break;
+        }
+    }
+    best.1
+}
+
 /// The server's buckets and cells.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Truth {
@@ -103,6 +138,7 @@ pub struct Truth {
     home: Vec<u32>,
     /// The points in a cell's places.
     owners: Vec<[u32; CELL_POINTS]>,
+    bucket_room: Vec<u32>,
     free: Vec<u32>,
     next: u32,
     /// Cells and buckets changed since [`Truth::clear_changes`].
@@ -122,6 +158,7 @@ impl Truth {
         let mut changed_instances = vec![0; dirty::words(instances.len())];
         dirty::mark_all(&mut changed_instances, instances.len());
         Truth {
+            bucket_room: instances.iter().map(|i| i.bucket_count).collect(),
             instances,
             buckets: vec![Bucket::default(); buckets],
             cells: vec![Cell::default(); cells + 1],
@@ -205,11 +242,17 @@ impl Truth {
         })
     }
 
-    /// Replaces an instance's grid by one with as many buckets or fewer, and empties it.
+    /// Most buckets that an instance's grid may have.
+    pub fn bucket_room(&self, instance: u32) -> u32 {
+        self.bucket_room[instance as usize]
+    }
+
+    /// Replaces an instance's grid by one with no more than [`Truth::bucket_room`] buckets, and
+    /// empties it.
     pub fn regrid(&mut self, instance: u32, mut grid: Instance) {
         let old = self.instances[instance as usize];
         grid.bucket_first = old.bucket_first;
-        grid.bucket_count = old.bucket_count;
+        grid.bucket_count = grid.bucket_count.min(self.bucket_room(instance));
         for bucket in old.bucket_first..old.bucket_first + old.bucket_count {
             for cell in self.buckets[bucket as usize].entries {
                 if cell != 0 {
@@ -418,6 +461,35 @@ mod tests {
                 "{answer:?}"
             );
         }
+    }
+
+    #[test]
+    fn a_thin_upright_figure_does_not_overflow_its_buckets() {
+        // The dimensions and the count for which 31·Dx·Dy is 3 times 17·Dx.
+        let mut grid = grid();
+        grid.dims = [18, 49, 27];
+        let cells: Vec<[u32; 3]> = (0..49u32)
+            .flat_map(|y| (0..16).map(move |i| [7 + i % 4, y, 12 + i / 4]))
+            .collect();
+        let overflow = |count: u32| {
+            let grid = Instance {
+                bucket_count: count,
+                ..grid
+            };
+            let mut load = vec![0; count as usize];
+            cells
+                .iter()
+                .for_each(|&cell| load[grid.bucket(cell) as usize] += 1);
+            load.into_iter()
+                .map(|n: usize| n.saturating_sub(BUCKET_ENTRIES))
+                .sum::<usize>()
+        };
+        assert!(overflow(367) > 0, "the paper's count overflows");
+        let count = choose_buckets(&grid, &cells, 367);
+        assert!(
+            count <= 367 && overflow(count) == 0,
+            "{count} buckets overflow"
+        );
     }
 
     #[test]

@@ -9,7 +9,7 @@ use crate::points::{PointError, SurfacePoint, generate, largest_radius, morton_o
 use crate::rays::{Against, CpuTracer, Deformed, TooManyTriangles, Tracer, offset_origin, reach};
 use crate::samples::{PointSamples, Samples};
 use crate::scene::{InstancePose, Mesh, Pose, Scene};
-use crate::truth::{Place, Placement, Truth, buckets_for, fit};
+use crate::truth::{Place, Placement, Truth, buckets_for, choose_buckets, fit};
 use glam::{Affine3A, DAffine3, Vec3, Vec3A};
 use psao_core::{Instance, Kernel};
 use rayon::prelude::*;
@@ -255,7 +255,6 @@ impl World {
         for placed in &placed {
             let mut grid = placed.grid;
             grid.bucket_first = buckets;
-            grid.bucket_count = buckets_for(placed.cells);
             buckets += grid.bucket_count;
             self.instance_of_bucket
                 .resize(buckets as usize, placed.instance);
@@ -489,10 +488,14 @@ impl World {
                 continue;
             }
             let points = carrier.points.clone();
-            let mut placements = self.placements(instance as u32, points.clone());
+            let place = |world: &World| {
+                let grid = &world.truth.instances[instance];
+                world.placements(instance as u32, points.clone(), grid)
+            };
+            let mut placements = place(self);
             if placements.iter().any(Option::is_none) {
                 self.regrid(instance as u32, points.clone());
-                placements = self.placements(instance as u32, points.clone());
+                placements = place(self);
             }
             for (point, at) in points.zip(placements) {
                 self.move_point(instance as u32, point, at);
@@ -528,14 +531,21 @@ impl World {
         let scale = scale_of(&self.pose.instances[instance as usize].world_from_local);
         let (cell_m, radius) = (self.options.cell_m(), 1.0 / self.options.cell_over_radius);
         // A pose that no grid fits (not finite, or flattened) leaves its points discarded.
-        if let Some(grid) = fit([min - margin, max + margin], scale, cell_m, radius) {
+        if let Some(mut grid) = fit([min - margin, max + margin], scale, cell_m, radius) {
+            let placements = self.placements(instance, points.clone(), &grid);
+            let cells = distinct_cells(&placements);
+            grid.bucket_count = choose_buckets(&grid, &cells, self.truth.bucket_room(instance));
             self.truth.regrid(instance, grid);
             self.places[points.start as usize..points.end as usize].fill(Place::NONE);
         }
     }
 
-    fn placements(&self, instance: u32, points: Range<u32>) -> Vec<Option<Placement>> {
-        let grid = &self.truth.instances[instance as usize];
+    fn placements(
+        &self,
+        instance: u32,
+        points: Range<u32>,
+        grid: &Instance,
+    ) -> Vec<Option<Placement>> {
         let triangles = &self.mesh(instance).triangles;
         let (positions, normals) = self.vertices(instance);
         self.points[points.start as usize..points.end as usize]
@@ -1027,7 +1037,7 @@ fn place_instance(
         Vec3::ZERO
     };
     let bounds = [bounds[0] - margin, bounds[1] + margin];
-    let grid = fit(
+    let mut grid = fit(
         bounds,
         scale,
         options.cell_m(),
@@ -1048,12 +1058,9 @@ fn place_instance(
             )
         })
         .collect();
-    let cells = placements
-        .iter()
-        .flatten()
-        .map(|at| at.cell)
-        .collect::<HashSet<_>>()
-        .len();
+    let cells = distinct_cells(&placements);
+    grid.bucket_count = choose_buckets(&grid, &cells, buckets_for(cells.len()));
+    let cells = cells.len();
     Some(Placed {
         instance,
         deforms,
@@ -1062,6 +1069,11 @@ fn place_instance(
         grid,
         cells,
     })
+}
+
+fn distinct_cells(placements: &[Option<Placement>]) -> Vec<[u32; 3]> {
+    let cells: HashSet<[u32; 3]> = placements.iter().flatten().map(|at| at.cell).collect();
+    cells.into_iter().collect()
 }
 
 fn extent(mesh: &Mesh) -> Vec3 {
