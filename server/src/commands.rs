@@ -160,7 +160,8 @@ pub fn record(args: &RecordArgs, progress: Progress<'_>) -> Result<u64, String> 
             .map(|path| Frustum::new(&path.at(time), settings.margin_rad))
     };
     let first = view(0.0);
-    world.converge(&|bounds| sees(&first, bounds), progress);
+    let report = |done, total| progress("first occlusion", done, total);
+    world.converge(&|bounds| sees(&first, bounds), world.options.rays, &report);
 
     let error = |error: std::io::Error| format!("{}: {error}", args.out.display());
     let temporary = args.out.with_extension("psao.part");

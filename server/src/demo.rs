@@ -11,7 +11,7 @@ use crate::report::{Form, Panel, Plot, Report};
 use crate::samples::Samples;
 use crate::server::{FrameReport, Server, uplink_camera};
 use crate::transport::{ClientId, Transport, TransportConfig};
-use crate::world::Progress;
+use crate::world::{FIRST_RAYS, Progress};
 use clap::Args;
 use glam::Vec3;
 use psao::quic::{Connect, Connection, Trust};
@@ -110,7 +110,7 @@ pub struct Figures {
     pub fetched: f64,
     /// Share of pixels without a point that counts.
     pub holes_share: f64,
-    /// Seconds until the first frame could be sent: points, grid, first occlusion.
+    /// Seconds until the first frame can be sent: scene, points, grid, first occlusion (64 rays).
     pub ready_s: f64,
     /// Median milliseconds a frame by stage.
     pub ms: BTreeMap<&'static str, f64>,
@@ -157,8 +157,12 @@ pub fn run(args: &DemoArgs, progress: Progress<'_>) -> Result<Figures, String> {
         .map(|frame| Frustum::new(&path.at(time_of(frame)), settings.margin_rad))
         .collect();
     let seen = |[min, max]: [Vec3; 2]| views.iter().any(|view| view.sees_box(min, max));
-    world.converge(&seen, progress);
+    let report = |stage: &'static str| move |done, total| progress(stage, done, total);
+    world.converge(&seen, FIRST_RAYS, &report("first occlusion"));
     let ready_s = start.elapsed().as_secs_f64();
+    // A live server would stream by now, and converge in the frames; here each frame is to show
+    // what the stream can do, so all rays come first.
+    world.converge(&seen, world.options.rays, &report("convergence"));
 
     let mut figures = Figures {
         scene: world.scene.name.clone(),

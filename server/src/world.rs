@@ -394,19 +394,20 @@ impl World {
         self.pose_at(time_s);
         self.mark_stale();
         self.place_deforming(visible);
-        self.trace(visible, converge_rays, &|_, _| ())
+        self.trace(visible, converge_rays, self.options.rays, &|_, _| ())
     }
 
-    /// Traces all `visible` slices with all rays, in stages of rising numbers of rays.
+    /// Traces all `visible` slices until each point has had `rays` of its rays (all of them if
+    /// `rays` is more), in stages of rising numbers.
     pub fn converge(
         &mut self,
         visible: &(dyn Fn([Vec3; 2]) -> bool + Sync),
-        progress: Progress<'_>,
+        rays: usize,
+        report: &(dyn Fn(u64, u64) + Sync),
     ) -> StepStats {
         let mut total = StepStats::default();
         loop {
-            let report = |done, all| progress("first occlusion", done, all);
-            let stats = self.trace(visible, u64::MAX, &report);
+            let stats = self.trace(visible, u64::MAX, rays, report);
             total.rays += stats.rays;
             total.points += stats.points;
             if stats.converging == 0 {
@@ -557,11 +558,13 @@ impl World {
             .collect()
     }
 
-    /// Traces what is visible and due. Slices that have not converged gain rays within the budget.
+    /// Traces what is visible and due. Slices with less than `goal` of their rays gain some, as far
+    /// as `converge_rays` goes.
     fn trace(
         &mut self,
         visible: &(dyn Fn([Vec3; 2]) -> bool + Sync),
         converge_rays: u64,
+        goal: usize,
         report: &(dyn Fn(u64, u64) + Sync),
     ) -> StepStats {
         let all = self.options.rays;
@@ -575,7 +578,7 @@ impl World {
             let points = slice.points.len() as u64;
             stats.rays_if_all += points * all as u64;
             let mut rays = slice.rays_done;
-            if rays < all {
+            if rays < goal.min(all) {
                 // Deforming points keep no bits, so they start with all rays.
                 let deforms = self.scene.instances[slice.instance as usize].deforms;
                 let next = if deforms {
@@ -588,7 +591,7 @@ impl World {
                     budget -= cost;
                     rays = next;
                 }
-                stats.converging += u64::from(rays < all);
+                stats.converging += u64::from(rays < goal.min(all));
             }
             if rays > slice.rays_done || slice.stale && rays > 0 {
                 due.push((index, rays));
