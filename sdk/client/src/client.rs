@@ -26,7 +26,7 @@ pub enum ClientError {
     Capacity(Capacity),
     /// The stream is of another scene (its hash).
     Scene(u64),
-    /// A frame's content does not decompress to what it says.
+    /// A frame's content is not one zstd frame of the size that it says.
     Compression,
     /// The server will not serve; the text is the server's.
     Refused(Option<Refusal>, String),
@@ -118,6 +118,10 @@ pub struct Client {
     raw: Vec<u8>,
     zstd: zstd::zstd_safe::DCtx<'static>,
     next_sequence: u32,
+    /// Number of the last frame that a packet came of.
+    last_frame: Option<u32>,
+    /// Number and time of the frame that is not complete.
+    open_frame: Option<(u32, u64)>,
     preamble_done: bool,
     /// The frame being received began with a reset of the mirror.
     in_snapshot: bool,
@@ -136,6 +140,8 @@ impl Client {
             raw: Vec::new(),
             zstd: zstd::zstd_safe::DCtx::create(),
             next_sequence: 0,
+            last_frame: None,
+            open_frame: None,
             preamble_done: false,
             in_snapshot: false,
             stats: Stats::default(),
@@ -143,12 +149,15 @@ impl Client {
     }
 
     /// Forgets the stream's position, for a new connection. The mirror keeps its contents (the
-    /// picture freezes rather than flashes) until the new stream's first snapshot.
+    /// picture freezes rather than flashes) until the new stream's first snapshot, or until its
+    /// header if the scene needs another capacity.
     pub fn restart(&mut self) {
         self.state = State::Connecting;
         self.header = None;
         self.input.clear();
         self.next_sequence = 0;
+        self.last_frame = None;
+        self.open_frame = None;
         self.preamble_done = false;
         self.in_snapshot = false;
     }
@@ -174,6 +183,9 @@ impl Client {
     fn push_bytes(&mut self, bytes: &[u8]) -> Result<Pushed, ClientError> {
         let mut rest = bytes;
         while !rest.is_empty() {
+            if self.state == State::Ended {
+                return Err(StreamError::Order.into());
+            }
             let wanted = self.wanted_bytes()?;
             if self.input.is_empty() && rest.len() >= wanted && self.preamble_done {
                 // The common case: read the packet where it lies.
@@ -265,22 +277,32 @@ impl Client {
             return Err(StreamError::Sequence.into());
         }
         self.next_sequence = packet.sequence.wrapping_add(1);
+        match packet.kind {
+            kind::FRAME => packet.check_flags(flag::SNAPSHOT | flag::LAST)?,
+            kind::HEADER | kind::END | kind::REFUSE => packet.check_flags(0)?,
+            _ => {}
+        }
         match (packet.kind, self.header) {
             (kind::HEADER, None) => self.begin(Header::read(packet.body)?).map(|()| None),
             (kind::FRAME, Some(header)) => self.frame(&header, packet),
-            (kind::END, Some(_)) if packet.body.is_empty() => {
+            (kind::END, Some(_)) if self.open_frame.is_none() => {
+                if !packet.body.is_empty() {
+                    return Err(StreamError::Length.into());
+                }
                 self.state = State::Ended;
                 Ok(None)
             }
             (kind::REFUSE, None) => {
                 let mut body = Reader(packet.body);
                 let refusal = Refusal::from_code(body.u16()?);
-                let text: String = String::from_utf8_lossy(body.0).chars().take(200).collect();
-                Err(ClientError::Refused(refusal, text))
+                let text = String::from_utf8_lossy(body.0);
+                let printable = text.chars().filter(|c| !c.is_control());
+                Err(ClientError::Refused(refusal, printable.take(200).collect()))
             }
             (kind::HEADER | kind::FRAME | kind::END | kind::REFUSE, _) => {
                 Err(StreamError::Order.into())
             }
+            (_, None) => Err(StreamError::Order.into()),
             _ if packet.flags & flag::OPTIONAL != 0 => Ok(None),
             (other, _) => Err(StreamError::Kind(other).into()),
         }
@@ -297,6 +319,8 @@ impl Client {
         }
         let Profile::Cells = header.profile;
         if self.mirror.capacity() != need {
+            // The old one goes first, so that both are never held at once.
+            self.mirror = Mirror::new(Heap::new(Capacity::default()));
             self.mirror = Mirror::new(Heap::new(need));
         }
         self.raw.resize(header.max_raw_bytes as usize, 0);
@@ -310,17 +334,34 @@ impl Client {
 
     fn frame(&mut self, header: &Header, packet: Packet<'_>) -> Result<Option<Frame>, ClientError> {
         let (frame, compressed) = Frame::read(packet.body)?;
-        if packet.flags & flag::SNAPSHOT != 0 {
+        let has = |flag: u8| packet.flags & flag != 0;
+        let (snapshot, last) = (has(flag::SNAPSHOT), has(flag::LAST));
+        if frame.raw_bytes > header.max_raw_bytes || !last && frame.mirror_hash != 0 {
+            return Err(StreamError::Value.into());
+        }
+        let in_order = match self.open_frame {
+            Some(open) => open == (frame.id, frame.time_ns) && !snapshot,
+            None => self
+                .last_frame
+                .is_none_or(|id| id.wrapping_add(1) == frame.id),
+        };
+        if !in_order {
+            return Err(StreamError::Order.into());
+        }
+        self.last_frame = Some(frame.id);
+        self.open_frame = (!last).then_some((frame.id, frame.time_ns));
+        if snapshot {
             self.mirror.reset();
             self.in_snapshot = true;
         } else if self.state == State::Desynchronised && !self.in_snapshot {
             return Ok(None);
         }
         let raw_bytes = frame.raw_bytes as usize;
-        if frame.raw_bytes > header.max_raw_bytes {
-            return Err(StreamError::Value.into());
-        }
         if raw_bytes > 0 {
+            // zstd itself would go on behind the first frame, and skip what is none.
+            if zstd::zstd_safe::find_frame_compressed_size(compressed) != Ok(compressed.len()) {
+                return Err(ClientError::Compression);
+            }
             let room = &mut self.raw[..raw_bytes];
             let written = self
                 .zstd
@@ -336,7 +377,7 @@ impl Client {
         } else if !compressed.is_empty() {
             return Err(StreamError::Length.into());
         }
-        if packet.flags & flag::LAST == 0 {
+        if !last {
             return Ok(None);
         }
         if self.mirror.hash() != frame.mirror_hash {
@@ -382,7 +423,7 @@ impl Client {
     pub fn memory_bytes(&self) -> u64 {
         self.mirror.capacity().bytes()
             + self.input.capacity() as u64
-            + self.raw.len() as u64
+            + self.raw.capacity() as u64
             + self.zstd.sizeof() as u64
     }
 }

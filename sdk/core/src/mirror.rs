@@ -82,7 +82,7 @@ pub struct PartsMut<'a> {
 /// Why a change was refused. The mirror is as before.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum MirrorError {
-    /// An index is outside its buffer.
+    /// An index is outside its buffer, or names cell 0.
     Index,
     /// A bucket names a cell that is not there.
     Entry,
@@ -211,10 +211,10 @@ impl<M: Memory> Mirror<M> {
         Ok(())
     }
 
-    /// Sets one cell. Any content is harmless to a reader.
+    /// Sets one cell, but not cell 0: no bucket can name it. Any content is harmless to a reader.
     pub fn set_cell(&mut self, index: u32, value: Cell) -> Result<(), MirrorError> {
         let capacity = self.capacity();
-        if index >= capacity.cells {
+        if index == 0 || index >= capacity.cells {
             return Err(MirrorError::Index);
         }
         let parts = self.memory.parts_mut();
@@ -427,14 +427,15 @@ mod tests {
             mirror.set_cell(8, cell(8)).unwrap();
             mirror.set_cell(100, Cell::default()).unwrap();
             let runs = |mirror: &Mirror<Borrowed<'_>>| -> Vec<_> {
-                mirror.dirty_runs(Buffer::Cells).collect()
+                let runs = mirror.dirty_runs(Buffer::Cells);
+                runs.map(|run| [run.start, run.end]).collect()
             };
-            assert_eq!(runs(mirror), [7..9]);
+            assert_eq!(runs(mirror), [[7, 9]]);
             mirror.clear_dirty();
             mirror.set_cell(8, cell(8)).unwrap();
-            assert_eq!(runs(mirror), []);
+            assert_eq!(runs(mirror), [[0; 2]; 0]);
             mirror.reset();
-            assert_eq!(runs(mirror), [7..9]);
+            assert_eq!(runs(mirror), [[7, 9]]);
             assert_eq!((mirror.hash(), mirror.recompute_hash()), (0, 0));
         });
     }
@@ -443,6 +444,7 @@ mod tests {
     fn changes_out_of_range_are_refused_and_change_nothing() {
         with_mirror(|mirror| {
             assert_eq!(mirror.set_cell(200, cell(1)), Err(MirrorError::Index));
+            assert_eq!(mirror.set_cell(0, cell(1)), Err(MirrorError::Index));
             assert_eq!(
                 mirror.set_bucket(70, Bucket::default()),
                 Err(MirrorError::Index)

@@ -65,6 +65,8 @@ pub enum StreamError {
     NotAStream,
     /// Another major version (the value).
     Version(u16),
+    /// A profile that this reader does not know (its number).
+    Profile(u8),
     /// A packet's checksum does not match: bytes were changed on the way.
     Checksum,
     /// A packet was lost or reordered.
@@ -77,7 +79,8 @@ pub enum StreamError {
     Value,
     /// An unknown packet kind that may not be skipped (the value).
     Kind(u8),
-    /// The packet is not allowed here (a frame before the header, a second header).
+    /// The packet is not allowed here: a frame before the header, a second header, a part of a
+    /// frame within another one, anything after the end.
     Order,
     /// The change cannot be applied to the mirror.
     Mirror(MirrorError),
@@ -97,6 +100,12 @@ impl core::fmt::Display for StreamError {
                 f,
                 "stream version {major}, this reader knows {VERSION_MAJOR}: \
                  use matching versions of server and SDK"
+            ),
+            StreamError::Profile(profile) => write!(
+                f,
+                "stream profile {profile}, this reader knows {}: \
+                 let the server use that one, or update the SDK",
+                Profile::Cells as u8
             ),
             StreamError::Checksum => f.write_str("a packet's checksum does not match"),
             StreamError::Sequence => f.write_str("a packet is missing or out of order"),
@@ -151,11 +160,11 @@ pub struct Header {
 /// What every part of a frame says of it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Frame {
-    /// Counts up by 1 a frame, from 1.
+    /// Counts up by 1 a frame, wrapping. Encoders begin with 1; a reader takes any first one.
     pub id: u32,
     /// Scene time of this state, nanoseconds since the scene's start.
     pub time_ns: u64,
-    /// [`Mirror::hash`] after the frame; 0 unless this is its last packet.
+    /// [`Mirror::hash`] after the frame; 0 in all but its last packet.
     pub mirror_hash: u64,
     /// Bytes of the decompressed content.
     pub raw_bytes: u32,
@@ -216,6 +225,15 @@ pub struct Packet<'a> {
 }
 
 impl<'a> Packet<'a> {
+    /// Checks that no flag but those of `known` is set: all others are reserved.
+    pub fn check_flags(&self, known: u8) -> Result<(), StreamError> {
+        if self.flags & !known == 0 {
+            Ok(())
+        } else {
+            Err(StreamError::Value)
+        }
+    }
+
     /// Reads the packet at the start of `bytes` and says how long it is, or `None` if more bytes
     /// are needed. `max_body_bytes` bounds what it may ask for.
     pub fn read(
@@ -309,7 +327,7 @@ impl Header {
         let _minor = r.u16()?;
         let profile = match r.u8()? {
             0 => Profile::Cells,
-            _ => return Err(StreamError::Value),
+            other => return Err(StreamError::Profile(other)),
         };
         let kernel = match r.u8()? {
             0 => Kernel::Paper,
@@ -333,7 +351,9 @@ impl Header {
         }
         let in_range = (64..=MAX_BODY_BYTES).contains(&max_body_bytes)
             && max_raw_bytes <= MAX_RAW_BYTES
-            && [ao_distance_m, density, rate_hz].iter().all(|v| *v >= 0.0);
+            && [ao_distance_m, density, rate_hz]
+                .iter()
+                .all(|v| v.is_finite() && *v >= 0.0);
         if !in_range {
             return Err(StreamError::Value);
         }

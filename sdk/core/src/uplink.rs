@@ -115,9 +115,13 @@ pub enum Message<'a> {
 }
 
 impl<'a> Message<'a> {
-    /// Reads a message. `None`: an unknown kind that may be skipped.
+    /// Reads a message. `None`: an unknown kind that may be skipped. Bytes after a hello's known
+    /// fields belong to a newer minor version and are ignored.
     pub fn read(packet: &Packet<'a>) -> Result<Option<Message<'a>>, StreamError> {
         let mut r = Reader(packet.body);
+        if (kind::HELLO..=kind::RESYNC).contains(&packet.kind) {
+            packet.check_flags(0)?;
+        }
         let message = match packet.kind {
             kind::HELLO => {
                 let major = r.u16()?;
@@ -136,11 +140,11 @@ impl<'a> Message<'a> {
                     return Err(StreamError::Value);
                 }
                 let token = r.take(token_bytes)?;
-                Message::Hello(Hello {
+                return Ok(Some(Message::Hello(Hello {
                     token,
                     scene_hash,
                     capacity,
-                })
+                })));
             }
             kind::CAMERA => {
                 let camera = Camera {
