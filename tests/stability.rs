@@ -337,7 +337,7 @@ fn world(mut scene: Scene, variant: &Variant, kernel: Kernel, density: f64, rays
         ..Options::of(kernel)
     };
     let mut world = World::new(scene, options, &|_, _, _| ()).unwrap();
-    world.converge(&|_| true, &|_, _, _| ());
+    world.converge(&|_| true, usize::MAX, &|_, _| ());
     world
 }
 
