@@ -20,6 +20,8 @@ pub mod grid;
 pub mod lookup;
 pub mod mirror;
 pub mod point;
+pub mod range;
+pub mod residual;
 pub mod stream;
 pub mod uplink;
 

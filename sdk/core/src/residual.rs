@@ -1,0 +1,1036 @@
+//! The residual codec: a slice's occlusion, from what the client has to what the server wants.
+//!
+//! A point's change is predicted from its neighbours' changes, of this frame where they come
+//! earlier in the slice and of the last frame where they come later. What is left is quantised
+//! and coded by [`crate::range`], with odds that depend on how much goes on around. Encoder and
+//! decoder run the same function over the same integers, so that both end in the same state.
+//!
+//! A slice depends on nothing but its own state: slices may be decoded in any order, on any
+//! thread, and one that is lost or not sent harms no other.
+#![deny(
+    clippy::unwrap_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    clippy::arithmetic_side_effects
+)]
+
+use crate::point::NORMALS;
+use crate::range::{Decoder, Encoder, Full, Odds};
+use crate::stream::StreamError;
+use bytemuck::{Pod, Zeroable};
+
+/// Most points of a slice.
+pub const SLICE_POINTS: usize = 1024;
+
+/// Points that share a flag for "nothing to do".
+const BLOCK: usize = 16;
+
+/// Neighbours of a point that come before it, and as many that come after.
+const NEIGHBOURS: usize = 3;
+
+/// How far away in the slice's order a neighbour may be. Points are in Morton order, so those
+/// near in space are near in the order.
+const WINDOW: usize = 128;
+
+/// A point's nearest neighbours on the same surface, as distances in the slice's order; 0 where
+/// there is none. Made by [`find_neighbours`] from what both sides know.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
+pub struct Neighbours {
+    /// Counted back.
+    pub earlier: [u8; NEIGHBOURS],
+    /// Counted forward.
+    pub later: [u8; NEIGHBOURS],
+}
+
+/// Normals in 1/127.
+static NORMAL_STEPS: [[i32; 3]; 256] = {
+    let mut table = [[0; 3]; 256];
+    let mut code = 0;
+    while code < 256 {
+        let mut axis = 0;
+        while axis < 3 {
+            #[allow(clippy::indexing_slicing, clippy::arithmetic_side_effects)]
+            {
+                table[code][axis] = (NORMALS[code][axis] * 127.0) as i32;
+                axis += 1;
+            }
+        }
+        #[allow(clippy::arithmetic_side_effects)]
+        {
+            code += 1;
+        }
+    }
+    table
+};
+
+/// Finds every point's neighbours in a slice.
+///
+/// `positions` are in steps of 1/32 cell, anywhere; `normals` are codes of
+/// [`crate::point::encode_normal`]. All slices have the same length; what is longer than the
+/// shortest, or than [`SLICE_POINTS`], is left alone.
+pub fn find_neighbours(positions: &[[u32; 3]], normals: &[u8], out: &mut [Neighbours]) {
+    let count = positions.len().min(normals.len()).min(out.len());
+    let count = count.min(SLICE_POINTS);
+    // The nearest so far, near ones first: distance in space and in the order.
+    const NONE: [(u32, u8); NEIGHBOURS] = [(u32::MAX, 0); NEIGHBOURS];
+    let mut later = [NONE; SLICE_POINTS];
+    for (at, (position, normal)) in positions.iter().zip(normals).take(count).enumerate() {
+        let mut earlier = NONE;
+        for back in 1..=WINDOW.min(at) {
+            let other = at.wrapping_sub(back);
+            let (Some(other_position), Some(other_normal), Some(other_later)) = (
+                positions.get(other),
+                normals.get(other),
+                later.get_mut(other),
+            ) else {
+                break;
+            };
+            let squared = squared(position, other_position);
+            // Facing another way only adds.
+            if squared >= farthest(&earlier).max(farthest(other_later)) {
+                continue;
+            }
+            let apart = squared.saturating_add(turned(squared, *normal, *other_normal));
+            keep(&mut earlier, (apart, back as u8));
+            keep(other_later, (apart, back as u8));
+        }
+        if let Some(out) = out.get_mut(at) {
+            out.earlier = earlier.map(|(_, back)| back);
+        }
+    }
+    for (out, later) in out.iter_mut().zip(&later).take(count) {
+        out.later = later.map(|(_, forward)| forward);
+    }
+}
+
+fn farthest(nearest: &[(u32, u8); NEIGHBOURS]) -> u32 {
+    let [.., (farthest, _)] = nearest;
+    *farthest
+}
+
+fn squared(p: &[u32; 3], q: &[u32; 3]) -> u32 {
+    let along = |p: u32, q: u32| {
+        let steps = p.abs_diff(q).min(1 << 14);
+        steps.wrapping_mul(steps)
+    };
+    let ([px, py, pz], [qx, qy, qz]) = (*p, *q);
+    along(px, qx)
+        .wrapping_add(along(py, qy))
+        .wrapping_add(along(pz, qz))
+}
+
+/// How much farther apart two points count because they face different ways: what is on the other
+/// side of an edge or a wall says little.
+fn turned(squared: u32, p: u8, q: u8) -> u32 {
+    let normal = |code: u8| {
+        NORMAL_STEPS
+            .get(usize::from(code))
+            .copied()
+            .unwrap_or_default()
+    };
+    let ([px, py, pz], [qx, qy, qz]) = (normal(p), normal(q));
+    let along = |p: i32, q: i32| p.wrapping_mul(q);
+    let dot = along(px, qx)
+        .wrapping_add(along(py, qy))
+        .wrapping_add(along(pz, qz));
+    // 0 where they face the same way, about 500 where opposite.
+    let turned = (127i32.wrapping_mul(127).wrapping_sub(dot).max(0) as u32) >> 6;
+    let more = u64::from(squared).wrapping_mul(u64::from(turned)) >> 5;
+    (turned << 1).saturating_add(more as u32)
+}
+
+/// Keeps a candidate if it is among the nearest.
+fn keep(nearest: &mut [(u32, u8); NEIGHBOURS], mut candidate: (u32, u8)) {
+    for kept in nearest {
+        if candidate.0 < kept.0 {
+            core::mem::swap(kept, &mut candidate);
+        }
+    }
+}
+
+/// What both sides know of a slice's points, besides where they are.
+#[derive(Debug)]
+pub struct SliceState<'a> {
+    /// Occlusion at the client: 255 is open.
+    pub value: &'a mut [u8],
+    /// Its last change, at most 127 either way. As many as values.
+    pub last: &'a mut [i8],
+}
+
+/// How coarse a slice is coded.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Quantiser {
+    /// Residuals are multiples of this many 1/255; 1 is lossless together with `dead_zone` 0.
+    pub step: u8,
+    /// A point that is off by no more than this many 1/255 is left as it is.
+    pub dead_zone: u8,
+}
+
+impl Quantiser {
+    /// No coded point is off by more than this many 1/255.
+    pub fn bound(self) -> u8 {
+        self.dead_zone.max(self.step / 2)
+    }
+}
+
+/// Codes a slice that the client has in this state, so that it gets near `target`, and brings the
+/// state to what the client will then have. `first`: the client has never had the slice; its
+/// state is taken for open and still, whatever it says. Returns the number of bytes.
+///
+/// `neighbours`, the state and `target` have the same length, at most [`SLICE_POINTS`]; what is
+/// longer than the shortest is left alone.
+///
+/// # Errors
+/// `out` has no room: [`MAX_SLICE_BYTES`] are always enough. The state is then worthless.
+pub fn encode_slice(
+    neighbours: &[Neighbours],
+    quantiser: Quantiser,
+    state: &mut SliceState<'_>,
+    target: &[u8],
+    first: bool,
+    out: &mut [u8],
+) -> Result<usize, Full> {
+    let mut side = Encode {
+        coder: Encoder::new(out),
+        target,
+        step: i32::from(quantiser.step.max(1)),
+        dead_zone: quantiser.dead_zone,
+    };
+    code_slice(&mut side, neighbours, quantiser.step, state, first);
+    side.coder.finish()
+}
+
+/// Decodes what [`encode_slice`] coded, with the same neighbours, `step`, state and `first`.
+///
+/// Takes time in proportion to the points, whatever the bytes.
+///
+/// # Errors
+/// [`StreamError::Length`]: the bytes are not what the encoder wrote. The state is then
+/// worthless. (Not every change of the bytes shows here: packets have checksums for that.)
+pub fn decode_slice(
+    neighbours: &[Neighbours],
+    step: u8,
+    state: &mut SliceState<'_>,
+    first: bool,
+    bytes: &[u8],
+) -> Result<(), StreamError> {
+    let mut side = Decode(Decoder::new(bytes));
+    code_slice(&mut side, neighbours, step, state, first);
+    side.0.finish()
+}
+
+/// Bytes that any slice fits in: at most 17 decisions a point, each of 10 bits at most.
+pub const MAX_SLICE_BYTES: usize = 24 << 10;
+
+/// Where encoder and decoder differ: the one knows the answers, the other reads them.
+trait Side {
+    /// Codes a decision: returns `wanted` when encoding, and what was read when decoding.
+    fn bit(&mut self, odds: &mut Odds, wanted: bool) -> bool;
+    /// A block's points need coding (not asked for when decoding).
+    fn moved(&self, first: usize, values: &[u8]) -> bool;
+    /// The steps to take from a point's predicted value (not asked for when decoding).
+    fn steps(&self, at: usize, predicted: i32) -> i32;
+}
+
+struct Encode<'a> {
+    coder: Encoder<'a>,
+    target: &'a [u8],
+    step: i32,
+    dead_zone: u8,
+}
+
+impl Side for Encode<'_> {
+    fn bit(&mut self, odds: &mut Odds, wanted: bool) -> bool {
+        self.coder.bit(odds, wanted);
+        wanted
+    }
+
+    fn moved(&self, first: usize, values: &[u8]) -> bool {
+        let target = self.target.get(first..).unwrap_or_default();
+        let off = target.iter().zip(values).map(|(t, v)| t.abs_diff(*v));
+        off.fold(0, u8::max) > self.dead_zone
+    }
+
+    fn steps(&self, at: usize, predicted: i32) -> i32 {
+        let target = self.target.get(at).copied().unwrap_or_default();
+        let off = i32::from(target).wrapping_sub(predicted);
+        let (far, step) = (off.wrapping_abs(), self.step);
+        if far <= i32::from(self.dead_zone) {
+            return 0;
+        }
+        let nearest = far.wrapping_add(step >> 1).checked_div(step).unwrap_or(0);
+        // Fewer steps cost fewer bits.
+        let fewer = nearest.wrapping_sub(1);
+        let rest = far.wrapping_sub(fewer.wrapping_mul(step));
+        let steps = if nearest > 1 && rest <= i32::from(self.dead_zone) {
+            fewer
+        } else {
+            nearest
+        };
+        steps.wrapping_mul(off.signum())
+    }
+}
+
+struct Decode<'a>(Decoder<'a>);
+
+impl Side for Decode<'_> {
+    fn bit(&mut self, odds: &mut Odds, _: bool) -> bool {
+        self.0.bit(odds)
+    }
+
+    fn moved(&self, _: usize, _: &[u8]) -> bool {
+        false
+    }
+
+    fn steps(&self, _: usize, _: i32) -> i32 {
+        0
+    }
+}
+
+/// Kinds of activity around a point.
+const ACTIVITIES: usize = 12;
+/// Kinds of predicted change.
+const PREDICTIONS: usize = 5;
+/// Steps coded one decision each; what is beyond follows in plain binary.
+const UNARY: usize = 14;
+
+/// The odds of all kinds of decisions.
+#[derive(Clone)]
+struct Contexts {
+    /// A block has something to do.
+    block: [Odds; 20],
+    /// A point has.
+    some: [[Odds; 2 * PREDICTIONS]; ACTIVITIES],
+    /// It goes down.
+    down: [Odds; 20],
+    /// It goes further.
+    more: [[Odds; ACTIVITIES]; UNARY],
+}
+
+const fn odds<const N: usize>(starts: [u8; N]) -> [Odds; N] {
+    let mut odds = [Odds::new(128); N];
+    let mut at = 0;
+    while at < N {
+        #[allow(clippy::indexing_slicing, clippy::arithmetic_side_effects)]
+        {
+            odds[at] = Odds::new(starts[at]);
+            at += 1;
+        }
+    }
+    odds
+}
+
+/// What is learnt starts anew with every slice, from what is usual.
+const START: Contexts = Contexts {
+    block: odds([
+        8, 109, 123, 161, 218, 83, 127, 140, 172, 238, 22, 121, 152, 170, 206, 52, 140, 160, 199,
+        245,
+    ]),
+    some: [
+        odds([18, 1, 37, 15, 102, 128, 146, 128, 64, 128]),
+        odds([30, 5, 35, 1, 95, 128, 65, 128, 93, 171]),
+        odds([40, 11, 42, 3, 162, 128, 62, 128, 121, 188]),
+        odds([46, 13, 39, 5, 103, 39, 109, 128, 182, 188]),
+        odds([52, 12, 49, 7, 83, 5, 186, 128, 195, 201]),
+        odds([60, 17, 57, 13, 65, 9, 170, 64, 233, 220]),
+        odds([76, 24, 71, 24, 73, 27, 87, 32, 228, 235]),
+        odds([97, 33, 92, 61, 80, 42, 92, 61, 238, 182]),
+        odds([128, 40, 125, 35, 108, 73, 100, 95, 115, 103]),
+        odds([154, 27, 157, 13, 155, 45, 114, 103, 120, 144]),
+        odds([171, 61, 175, 70, 188, 16, 186, 65, 142, 152]),
+        odds([176, 61, 179, 70, 204, 16, 211, 65, 193, 214]),
+    ],
+    down: odds([
+        78, 66, 54, 43, 135, 114, 94, 74, 180, 151, 95, 72, 190, 172, 151, 129, 216, 206, 196, 184,
+    ]),
+    more: [
+        odds([3, 6, 7, 8, 10, 13, 17, 24, 35, 49, 72, 162]),
+        odds([32, 24, 27, 29, 28, 32, 33, 34, 38, 45, 65, 167]),
+        odds([133, 127, 104, 101, 75, 82, 83, 69, 70, 73, 96, 181]),
+        odds([163, 177, 157, 178, 160, 167, 156, 133, 121, 103, 121, 189]),
+        odds([226, 215, 234, 229, 221, 219, 212, 201, 173, 148, 139, 196]),
+        odds([224, 233, 244, 225, 233, 232, 224, 226, 202, 171, 146, 200]),
+        odds([249, 250, 245, 221, 241, 249, 236, 228, 224, 198, 150, 204]),
+        odds([254, 255, 245, 245, 250, 237, 228, 236, 231, 213, 159, 208]),
+        odds([241, 226, 215, 202, 206, 208, 209, 219, 232, 220, 188, 211]),
+        odds([253, 231, 225, 239, 245, 233, 233, 231, 231, 228, 168, 202]),
+        odds([255, 249, 250, 243, 255, 250, 253, 243, 251, 240, 187, 203]),
+        odds([255, 254, 255, 234, 237, 238, 241, 245, 252, 239, 181, 221]),
+        odds([255, 237, 255, 230, 220, 219, 233, 251, 246, 244, 221, 226]),
+        odds([255, 211, 218, 251, 228, 228, 237, 240, 241, 246, 208, 220]),
+    ],
+};
+/// The same for a slice that the client has never had.
+const START_FIRST: Contexts = Contexts {
+    block: odds([
+        41, 128, 128, 128, 128, 233, 128, 128, 128, 128, 95, 128, 128, 128, 128, 215, 128, 128,
+        128, 128,
+    ]),
+    some: [
+        odds([17, 7, 82, 128, 111, 128, 122, 128, 144, 128]),
+        odds([63, 14, 106, 128, 150, 128, 162, 128, 188, 128]),
+        odds([105, 12, 127, 128, 143, 128, 151, 128, 168, 128]),
+        odds([167, 8, 185, 128, 185, 128, 183, 128, 189, 128]),
+        odds([234, 10, 207, 128, 196, 128, 187, 128, 189, 128]),
+        odds([232, 9, 233, 128, 214, 128, 201, 128, 200, 128]),
+        odds([203, 5, 225, 128, 219, 128, 217, 128, 211, 128]),
+        odds([204, 7, 223, 128, 223, 128, 226, 128, 217, 128]),
+        odds([171, 9, 205, 128, 215, 128, 227, 128, 225, 128]),
+        odds([190, 13, 212, 128, 204, 128, 210, 128, 231, 128]),
+        odds([133, 2, 183, 128, 200, 128, 198, 128, 238, 128]),
+        odds([169, 10, 206, 128, 207, 128, 203, 128, 247, 128]),
+    ],
+    down: odds([
+        128, 128, 128, 128, 128, 128, 128, 128, 158, 128, 128, 128, 128, 128, 128, 128, 128, 128,
+        128, 128,
+    ]),
+    more: [
+        odds([92, 107, 93, 118, 110, 120, 154, 179, 198, 202, 200, 213]),
+        odds([165, 112, 106, 103, 87, 94, 134, 161, 185, 200, 209, 224]),
+        odds([219, 145, 144, 130, 127, 124, 135, 153, 178, 204, 222, 237]),
+        odds([238, 163, 185, 173, 164, 150, 143, 154, 177, 205, 224, 239]),
+        odds([243, 204, 218, 200, 193, 174, 156, 163, 181, 207, 227, 241]),
+        odds([246, 213, 233, 219, 219, 198, 177, 177, 189, 210, 227, 241]),
+        odds([249, 225, 243, 236, 232, 218, 200, 192, 198, 215, 230, 242]),
+        odds([249, 236, 246, 242, 236, 224, 211, 207, 207, 218, 232, 242]),
+        odds([250, 246, 247, 244, 244, 235, 227, 219, 215, 220, 233, 242]),
+        odds([251, 249, 248, 248, 245, 241, 235, 226, 222, 223, 234, 242]),
+        odds([251, 244, 250, 249, 245, 244, 238, 232, 228, 228, 237, 242]),
+        odds([248, 247, 249, 250, 249, 245, 239, 236, 232, 229, 237, 244]),
+        odds([251, 249, 252, 249, 249, 247, 240, 237, 234, 230, 236, 242]),
+        odds([252, 252, 252, 251, 250, 246, 242, 239, 235, 231, 236, 241]),
+    ],
+};
+
+/// Weights of neighbours' changes in 1/64: now, and in the last frame if earlier or later in the
+/// order; and of the own last.
+const NOW: i32 = 16;
+const BEFORE: i32 = 4;
+const LATER: i32 = 6;
+const OWN: i32 = 0;
+
+/// A point's part in its neighbours' prediction: in the upper half the weighted change, in the
+/// lower how much went on there. Parts can be added as they are.
+fn part(change: i32, activity: i32) -> i32 {
+    (change << 16).wrapping_add(activity)
+}
+
+fn activity_kind(activity: i32) -> usize {
+    match activity {
+        i32::MIN..=0 => 0,
+        1..=2 => 1,
+        3..=4 => 2,
+        5..=6 => 3,
+        7..=9 => 4,
+        10..=13 => 5,
+        14..=19 => 6,
+        20..=27 => 7,
+        28..=39 => 8,
+        40..=59 => 9,
+        60..=90 => 10,
+        _ => 11,
+    }
+}
+
+/// The same for both sides.
+fn code_slice<S: Side>(
+    side: &mut S,
+    neighbours: &[Neighbours],
+    step: u8,
+    state: &mut SliceState<'_>,
+    first: bool,
+) {
+    let count = neighbours
+        .len()
+        .min(state.value.len())
+        .min(state.last.len());
+    let count = count.min(SLICE_POINTS);
+    let (Some(neighbours), Some(values), Some(lasts)) = (
+        neighbours.get(..count),
+        state.value.get_mut(..count),
+        state.last.get_mut(..count),
+    ) else {
+        return;
+    };
+    if first {
+        values.fill(255);
+        lasts.fill(0);
+        code_points::<S, true>(side, neighbours, step, values, lasts);
+    } else {
+        code_points::<S, false>(side, neighbours, step, values, lasts);
+    }
+}
+
+fn code_points<S: Side, const FIRST: bool>(
+    side: &mut S,
+    neighbours: &[Neighbours],
+    step: u8,
+    values: &mut [u8],
+    lasts: &mut [i8],
+) {
+    let mut contexts = if FIRST { START_FIRST } else { START };
+    let mut parts = [0i32; SLICE_POINTS];
+    for (part_of, last) in
+        parts
+            .iter_mut()
+            .zip(lasts.iter())
+            .take(if FIRST { 0 } else { SLICE_POINTS })
+    {
+        let last = i32::from(*last);
+        *part_of = part(last.wrapping_mul(LATER), last.wrapping_abs());
+    }
+    let mut blocks_before = 0usize;
+    let blocks = values
+        .chunks_mut(BLOCK)
+        .zip(lasts.chunks_mut(BLOCK))
+        .zip(neighbours.chunks(BLOCK));
+    for (block, ((values, lasts), neighbours)) in blocks.enumerate() {
+        let start = block.wrapping_mul(BLOCK);
+        let busy = lasts.iter().filter(|last| **last != 0).count();
+        let kind = match busy {
+            0..=2 => busy,
+            3..=5 => 3,
+            _ => 4,
+        };
+        let odds = contexts
+            .block
+            .get_mut(blocks_before.wrapping_mul(5).wrapping_add(kind));
+        let Some(odds) = odds else { return };
+        let wanted = side.moved(start, values);
+        let moved = side.bit(odds, wanted);
+        blocks_before = (blocks_before << 1 | usize::from(moved)) & 3;
+        if !moved {
+            let parts = parts.iter_mut().skip(start);
+            for (last, part_of) in lasts.iter_mut().zip(parts) {
+                *part_of = part(i32::from(*last).wrapping_mul(BEFORE), 0);
+                *last = 0;
+            }
+            continue;
+        }
+        let points = values.iter_mut().zip(lasts.iter_mut()).zip(neighbours);
+        for (at, ((value, last), neighbours)) in (start..).zip(points) {
+            let mut sum = 0i32;
+            for back in neighbours.earlier {
+                sum = sum.wrapping_add(get(&parts, at.wrapping_sub(usize::from(back))));
+            }
+            if FIRST {
+                let predicted = 255i32
+                    .wrapping_sub((sum >> 16).wrapping_add(32) >> 6)
+                    .clamp(0, 255);
+                let [a, b, c] = neighbours
+                    .earlier
+                    .map(|back| get(&parts, at.wrapping_sub(usize::from(back))) >> 16);
+                let spread = a.max(b).max(c).wrapping_sub(a.min(b).min(c)) >> 5;
+                let wanted = side.steps(at, predicted);
+                let steps = code_steps(
+                    side,
+                    &mut contexts,
+                    sum & 0xffff,
+                    spread,
+                    0,
+                    0,
+                    predicted,
+                    wanted,
+                );
+                let moved = steps.wrapping_mul(i32::from(step));
+                let has = predicted.wrapping_add(moved).clamp(0, 255);
+                *value = has as u8;
+                if let Some(part_of) = parts.get_mut(at) {
+                    *part_of = part(
+                        255i32.wrapping_sub(has).wrapping_mul(21),
+                        has.abs_diff(predicted) as i32,
+                    );
+                }
+                continue;
+            }
+            for forward in neighbours.later {
+                sum = sum.wrapping_add(get(&parts, at.wrapping_add(usize::from(forward))));
+            }
+            let old = i32::from(*last);
+            let activity = (sum & 0xffff).wrapping_add(old.wrapping_abs() << 1);
+            let change = (sum >> 16).wrapping_add(old.wrapping_mul(OWN));
+            let rounding = change.wrapping_add(32) & 63;
+            let change = change.wrapping_add(32) >> 6;
+            let had = i32::from(*value);
+            let predicted = had.wrapping_add(change).clamp(0, 255);
+            let wanted = side.steps(at, predicted);
+            let steps = code_steps(
+                side,
+                &mut contexts,
+                activity,
+                change.wrapping_abs(),
+                change,
+                rounding,
+                predicted,
+                wanted,
+            );
+            let moved = steps.wrapping_mul(i32::from(step));
+            let has = predicted.wrapping_add(moved).clamp(0, 255);
+            let change = has.wrapping_sub(had).clamp(-127, 127);
+            *value = has as u8;
+            *last = change as i8;
+            if let Some(part_of) = parts.get_mut(at) {
+                let weighted = change
+                    .wrapping_mul(NOW)
+                    .wrapping_add(old.wrapping_mul(BEFORE));
+                *part_of = part(weighted, change.wrapping_abs() << 1);
+            }
+        }
+    }
+}
+
+fn get(parts: &[i32; SLICE_POINTS], at: usize) -> i32 {
+    parts
+        .get(at & (SLICE_POINTS.wrapping_sub(1)))
+        .copied()
+        .unwrap_or_default()
+}
+
+fn code_steps<S: Side>(
+    side: &mut S,
+    contexts: &mut Contexts,
+    activity: i32,
+    size: i32,
+    change: i32,
+    rounding: i32,
+    predicted: i32,
+    wanted: i32,
+) -> i32 {
+    let kind = activity_kind(activity);
+    let size = match size {
+        0 => 0,
+        1 => 1,
+        2 => 2,
+        3..=4 => 3,
+        _ => 4,
+    };
+    let open = usize::from(predicted == 255);
+    let row = contexts.some.get_mut(kind);
+    let Some(odds) = row.and_then(|row| row.get_mut(size << 1 | open)) else {
+        return 0;
+    };
+    if !side.bit(odds, wanted != 0) {
+        return 0;
+    }
+    let down = match predicted {
+        0 => false,
+        255 => true,
+        _ => {
+            let way = (change.clamp(-2, 2).wrapping_add(2) << 2 | rounding >> 4) as usize;
+            let Some(odds) = contexts.down.get_mut(way) else {
+                return 0;
+            };
+            side.bit(odds, wanted < 0)
+        }
+    };
+    let wanted = wanted.unsigned_abs();
+    let mut steps = 1u32;
+    for row in &mut contexts.more {
+        let Some(odds) = row.get_mut(kind) else {
+            break;
+        };
+        if !side.bit(odds, wanted > steps) {
+            return if down {
+                0i32.wrapping_sub(steps as i32)
+            } else {
+                steps as i32
+            };
+        }
+        steps = steps.wrapping_add(1);
+    }
+    let mut rest = 0u32;
+    let wanted = wanted.wrapping_sub(steps);
+    for bit in (0..8).rev() {
+        let set = side.bit(&mut Odds::new(128), wanted >> bit & 1 != 0);
+        rest |= u32::from(set) << bit;
+    }
+    let steps = steps.wrapping_add(rest) as i32;
+    if down {
+        0i32.wrapping_sub(steps)
+    } else {
+        steps
+    }
+}
+
+#[cfg(test)]
+#[allow(
+    clippy::indexing_slicing,
+    clippy::unwrap_used,
+    clippy::arithmetic_side_effects
+)]
+mod tests {
+    extern crate std;
+    use super::*;
+    use std::vec;
+    use std::vec::Vec;
+
+    /// Pseudo-random numbers below a limit.
+    struct Random(u32);
+
+    impl Random {
+        fn below(&mut self, limit: u32) -> u32 {
+            self.0 = self.0.wrapping_mul(747796405).wrapping_add(2891336453);
+            let mixed = (self.0 >> 16 ^ self.0).wrapping_mul(0x7feb352d);
+            (mixed ^ mixed >> 15) % limit
+        }
+    }
+
+    /// A slice on two walls, and a shadow that wanders over it.
+    struct Scene {
+        positions: Vec<[u32; 3]>,
+        neighbours: Vec<Neighbours>,
+    }
+
+    impl Scene {
+        fn new(points: usize, seed: u32) -> Scene {
+            let mut random = Random(seed);
+            let mut positions = Vec::new();
+            let mut normals = Vec::new();
+            for at in 0..points as u32 {
+                // Morton order on a 32 x 32 patch, folded in the middle.
+                let even = |v: u32| (0..5).map(|bit| (v >> (2 * bit) & 1) << bit).sum::<u32>();
+                let [u, v] = [even(at), even(at >> 1)].map(|c| c * 19 + random.below(12));
+                let fold = 16 * 19;
+                positions.push([u.min(fold), v, u.saturating_sub(fold)]);
+                normals.push(if u < fold { 0x77 } else { 0x7e });
+            }
+            let mut neighbours = vec![Neighbours::default(); points];
+            find_neighbours(&positions, &normals, &mut neighbours);
+            Scene {
+                positions,
+                neighbours,
+            }
+        }
+
+        fn target(&self, frame: u32, random: &mut Random) -> Vec<u8> {
+            let darkness = |p: &[u32; 3]| {
+                let centre = [40 + frame * 9 % 900, 300, 20];
+                let off: u32 = p
+                    .iter()
+                    .zip(&centre)
+                    .map(|(p, c)| p.abs_diff(*c).pow(2))
+                    .sum();
+                180u32.saturating_sub(off / 150)
+            };
+            let noisy = |dark: u32| if dark > 0 { dark + random.below(4) } else { 0 };
+            self.positions
+                .iter()
+                .map(darkness)
+                .map(noisy)
+                .map(|dark| 255 - dark as u8)
+                .collect()
+        }
+    }
+
+    #[derive(Clone, Debug, PartialEq)]
+    struct Owned {
+        value: Vec<u8>,
+        last: Vec<i8>,
+    }
+
+    impl Owned {
+        fn new(points: usize) -> Owned {
+            Owned {
+                value: vec![99; points],
+                last: vec![-3; points],
+            }
+        }
+
+        fn state(&mut self) -> SliceState<'_> {
+            SliceState {
+                value: &mut self.value,
+                last: &mut self.last,
+            }
+        }
+    }
+
+    fn encode(
+        scene: &Scene,
+        quantiser: Quantiser,
+        state: &mut Owned,
+        target: &[u8],
+        first: bool,
+    ) -> Vec<u8> {
+        let mut out = vec![0; MAX_SLICE_BYTES];
+        let state = &mut state.state();
+        let length = encode_slice(&scene.neighbours, quantiser, state, target, first, &mut out);
+        out.truncate(length.unwrap());
+        out
+    }
+
+    /// Codes a frame, checks that both sides agree and are within the bound, and returns the bytes.
+    fn both(
+        scene: &Scene,
+        quantiser: Quantiser,
+        [server, client]: &mut [Owned; 2],
+        target: &[u8],
+        first: bool,
+    ) -> Vec<u8> {
+        let bytes = encode(scene, quantiser, server, target, first);
+        let state = &mut client.state();
+        decode_slice(&scene.neighbours, quantiser.step, state, first, &bytes).unwrap();
+        assert!(server == client, "{quantiser:?}");
+        for (value, target) in server.value.iter().zip(target) {
+            assert!(
+                value.abs_diff(*target) <= quantiser.bound(),
+                "{quantiser:?}"
+            );
+        }
+        bytes
+    }
+
+    const LENGTHS: [usize; 7] = [0, 1, 15, 16, 17, 1000, SLICE_POINTS];
+
+    #[test]
+    fn both_sides_end_the_same_and_within_the_bound_whatever_the_step_and_length() {
+        for points in LENGTHS {
+            let scene = Scene::new(points, 1);
+            for step in 1..=16 {
+                for dead_zone in [0, step / 2, step] {
+                    let quantiser = Quantiser { step, dead_zone };
+                    let mut random = Random(u32::from(step));
+                    let mut sides = [Owned::new(points), Owned::new(points)];
+                    for frame in 0..8 {
+                        let target = scene.target(frame * 3, &mut random);
+                        both(&scene, quantiser, &mut sides, &target, frame == 0);
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn targets_without_any_order_are_coded_in_the_bytes_promised() {
+        let scene = Scene::new(SLICE_POINTS, 2);
+        let mut random = Random(3);
+        for (step, dead_zone) in [(1, 0), (7, 200), (255, 0), (255, 255)] {
+            let mut sides = [Owned::new(SLICE_POINTS), Owned::new(SLICE_POINTS)];
+            for frame in 0..20 {
+                // Noise, then black and white at random: the longest jumps.
+                let steep = frame % 2 * 254 + 1;
+                let target: Vec<u8> = (0..SLICE_POINTS)
+                    .map(|_| (random.below(256) / steep * steep) as u8)
+                    .collect();
+                both(
+                    &scene,
+                    Quantiser { step, dead_zone },
+                    &mut sides,
+                    &target,
+                    frame == 0,
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn step_1_without_dead_zone_loses_nothing() {
+        let scene = Scene::new(SLICE_POINTS, 1);
+        let quantiser = Quantiser {
+            step: 1,
+            dead_zone: 0,
+        };
+        assert_eq!(quantiser.bound(), 0);
+        let mut sides = [Owned::new(SLICE_POINTS), Owned::new(SLICE_POINTS)];
+        for frame in 0..10 {
+            let target = scene.target(frame, &mut Random(frame));
+            both(&scene, quantiser, &mut sides, &target, frame == 0);
+            assert_eq!(sides[0].value, target);
+        }
+    }
+
+    #[test]
+    fn what_is_open_or_within_the_dead_zone_costs_next_to_nothing() {
+        let scene = Scene::new(SLICE_POINTS, 1);
+        let quantiser = Quantiser {
+            step: 3,
+            dead_zone: 2,
+        };
+        let mut sides = [Owned::new(SLICE_POINTS), Owned::new(SLICE_POINTS)];
+        let open = vec![253; SLICE_POINTS];
+        let bytes = both(&scene, quantiser, &mut sides, &open, true);
+        assert!(bytes.len() <= 2, "{} bytes", bytes.len());
+        let bytes = both(&scene, quantiser, &mut sides, &open, false);
+        assert!(bytes.len() <= 2, "{} bytes", bytes.len());
+        assert_eq!(sides[0].value, [255; SLICE_POINTS]);
+    }
+
+    #[test]
+    fn output_without_room_is_an_error_however_little_is_missing() {
+        let scene = Scene::new(SLICE_POINTS, 1);
+        let quantiser = Quantiser {
+            step: 2,
+            dead_zone: 1,
+        };
+        let target = scene.target(9, &mut Random(1));
+        let length = encode(
+            &scene,
+            quantiser,
+            &mut Owned::new(SLICE_POINTS),
+            &target,
+            true,
+        )
+        .len();
+        for room in 0..length {
+            let (mut out, mut state) = (vec![0; room], Owned::new(SLICE_POINTS));
+            let state = &mut state.state();
+            let result = encode_slice(&scene.neighbours, quantiser, state, &target, true, &mut out);
+            assert_eq!(result, Err(Full));
+        }
+    }
+
+    #[test]
+    fn changed_cut_and_lengthened_bytes_do_no_harm() {
+        let scene = Scene::new(SLICE_POINTS, 1);
+        let quantiser = Quantiser {
+            step: 3,
+            dead_zone: 2,
+        };
+        let mut sides = [Owned::new(SLICE_POINTS), Owned::new(SLICE_POINTS)];
+        both(
+            &scene,
+            quantiser,
+            &mut sides,
+            &scene.target(0, &mut Random(1)),
+            true,
+        );
+        let before = sides[0].clone();
+        let target = scene.target(1, &mut Random(2));
+        let bytes = both(&scene, quantiser, &mut sides, &target, false);
+        let decode = |bytes: &[u8]| {
+            let mut state = before.clone();
+            let result = decode_slice(&scene.neighbours, 3, &mut state.state(), false, bytes);
+            result.map(|()| state)
+        };
+        assert!(decode(&bytes).as_ref() == Ok(&sides[0]));
+        // A cut or changed run can end as some other slice would; it must be rare.
+        let mut unnoticed = 0;
+        for length in 0..bytes.len() {
+            unnoticed += u32::from(decode(&bytes[..length]).is_ok());
+        }
+        for bit in 0..bytes.len() * 8 {
+            let mut changed = bytes.clone();
+            changed[bit / 8] ^= 1 << (bit % 8);
+            unnoticed += u32::from(decode(&changed).is_ok());
+        }
+        assert!(
+            unnoticed < bytes.len() as u32,
+            "{unnoticed} of {}",
+            bytes.len() * 9
+        );
+        for more in 0..=255 {
+            let mut longer = bytes.clone();
+            longer.push(more);
+            assert!(decode(&longer) == Err(StreamError::Length));
+            longer.extend([0; 12]);
+            assert!(decode(&longer) == Err(StreamError::Length));
+        }
+    }
+
+    #[test]
+    fn random_bytes_are_decoded_to_an_end() {
+        let mut random = Random(4);
+        let scene = Scene::new(SLICE_POINTS, 1);
+        for _ in 0..100_000 {
+            let points = LENGTHS[random.below(6) as usize].min(64);
+            let bytes: Vec<u8> = (0..random.below(40))
+                .map(|_| random.below(256) as u8)
+                .collect();
+            let mut state = Owned {
+                value: (0..points).map(|_| random.below(256) as u8).collect(),
+                last: (0..points).map(|_| random.below(256) as i8).collect(),
+            };
+            let (step, first) = (random.below(256) as u8, random.below(2) == 0);
+            let neighbours = &scene.neighbours[..points];
+            let _ = decode_slice(neighbours, step, &mut state.state(), first, &bytes);
+        }
+    }
+
+    #[test]
+    fn neighbours_that_do_not_exist_are_harmless() {
+        let wild = vec![
+            Neighbours {
+                earlier: [255; 3],
+                later: [255; 3]
+            };
+            SLICE_POINTS
+        ];
+        let scene = Scene {
+            neighbours: wild,
+            ..Scene::new(SLICE_POINTS, 1)
+        };
+        let quantiser = Quantiser {
+            step: 3,
+            dead_zone: 2,
+        };
+        let mut sides = [Owned::new(SLICE_POINTS), Owned::new(SLICE_POINTS)];
+        for frame in 0..3 {
+            let target = scene.target(frame, &mut Random(1));
+            both(&scene, quantiser, &mut sides, &target, frame == 0);
+        }
+    }
+
+    #[test]
+    fn neighbours_are_the_nearest_on_the_same_side() {
+        let scene = Scene::new(SLICE_POINTS, 1);
+        for (at, neighbours) in scene.neighbours.iter().enumerate() {
+            let distance = |other: usize| -> u32 {
+                let pair = scene.positions[at].iter().zip(&scene.positions[other]);
+                pair.map(|(a, b)| a.abs_diff(*b).pow(2)).sum()
+            };
+            for back in neighbours.earlier.map(usize::from) {
+                assert!(back <= at && (back > 0 || at < 3), "{at}: {neighbours:?}");
+            }
+            for forward in neighbours.later.map(usize::from) {
+                let left = SLICE_POINTS - 1 - at;
+                assert!(
+                    forward <= left && (forward > 0 || left < 3),
+                    "{at}: {neighbours:?}"
+                );
+            }
+            // On a jittered lattice of 19 steps, the last of each four has one next door.
+            if at % 4 == 3 {
+                let nearest = distance(at - usize::from(neighbours.earlier[0]));
+                assert!(nearest <= 31 * 31 + 12 * 12, "{at}: {nearest}");
+            }
+        }
+        // Two sheets back to back: neighbours are on the own side, though the other is nearer.
+        let positions: Vec<[u32; 3]> = (0..64).map(|at| [at / 2 * 10, 0, at % 2]).collect();
+        let normals: Vec<u8> = (0..64)
+            .map(|at| if at % 2 == 0 { 0x77 } else { 0 })
+            .collect();
+        let mut found = vec![Neighbours::default(); 64];
+        find_neighbours(&positions, &normals, &mut found);
+        assert!(
+            found[10..54]
+                .iter()
+                .all(|n| n.earlier[0] % 2 == 0 && n.later[0] % 2 == 0)
+        );
+    }
+
+    #[test]
+    fn decoded_states_are_the_same_on_every_machine() {
+        let mut hash = 0xcbf2_9ce4_8422_2325u64;
+        let mut add = |byte: u8| {
+            hash = (hash ^ u64::from(byte)).wrapping_mul(0x100_0000_01b3);
+        };
+        for points in LENGTHS {
+            let scene = Scene::new(points, 7);
+            let mut random = Random(8);
+            let mut sides = [Owned::new(points), Owned::new(points)];
+            for frame in 0..40 {
+                let step = 1 + random.below(6) as u8;
+                let quantiser = Quantiser {
+                    step,
+                    dead_zone: random.below(5) as u8,
+                };
+                let target = scene.target(frame, &mut random);
+                let bytes = both(&scene, quantiser, &mut sides, &target, frame % 16 == 0);
+                bytes.iter().for_each(|byte| add(*byte));
+                sides[1].value.iter().for_each(|value| add(*value));
+                sides[1].last.iter().for_each(|last| add(*last as u8));
+            }
+        }
+        assert_eq!(hash, 8537680258013260814);
+    }
+}
