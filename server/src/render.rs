@@ -16,9 +16,9 @@ pub const REFERENCE_RAYS: usize = 512;
 pub struct Fragment {
     /// Instance index.
     pub instance: u32,
-    /// Position in the instance's local space: what an engine passes as a varying.
+    /// Position in the instance's local (or rest) space: what an engine passes as a varying.
     pub position: Vec3,
-    /// Shading normal in local space, towards the viewer's side of a double-sided surface.
+    /// Shading normal in that space, towards the viewer's side of a double-sided surface.
     pub normal: Vec3,
     /// World position, metres from the scene's origin.
     world_position: Vec3,
@@ -152,10 +152,11 @@ fn first_visible(world: &World, mut origin: Vec3, direction: Vec3) -> Option<Fra
         }
         let normal = surface.normal(&mesh.triangles, positions, normals);
         let tangent = surface.tangent(&mesh.triangles, positions);
+        let (grid_positions, grid_normals) = world.grid_vertices(hit.instance);
         return Some(Fragment {
             instance: hit.instance,
-            position,
-            normal,
+            position: surface.position(&mesh.triangles, grid_positions),
+            normal: surface.normal(&mesh.triangles, grid_positions, grid_normals),
             world_position,
             world_normal: pose.world_normal(normal),
             outward: if surface.back { -front } else { front },

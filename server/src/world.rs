@@ -39,6 +39,9 @@ pub struct Options {
     pub cell_over_radius: f32,
     /// Seed of the point placement.
     pub seed: u64,
+    /// Points of deforming instances keep their cells in rest space, as profile `residual` needs
+    /// it; else they move through the cells of the posed local space, as in the paper.
+    pub rest_space: bool,
 }
 
 impl Options {
@@ -58,6 +61,7 @@ impl Options {
             radius_over_rm,
             cell_over_radius,
             seed: 1,
+            rest_space: false,
         }
     }
 
@@ -132,7 +136,8 @@ pub struct Slice {
 struct Carrier {
     points: Range<u32>,
     slices: Range<u32>,
-    deforms: bool,
+    /// Its points move through cells.
+    loose: bool,
     /// Points have not been moved to the present pose.
     unplaced: bool,
 }
@@ -258,8 +263,8 @@ impl World {
             buckets += grid.bucket_count;
             self.instance_of_bucket
                 .resize(buckets as usize, placed.instance);
-            // What deforms opens new cells before the old ones are empty.
-            cells += if placed.deforms {
+            // What moves opens new cells before the old ones are empty.
+            cells += if placed.loose {
                 placed.cells * 2 + 64
             } else {
                 placed.cells
@@ -270,15 +275,15 @@ impl World {
         self.points.reserve_exact(total);
         self.places.reserve_exact(total);
         // Rigid instances first: their cells never change and lie slice by slice.
-        let rigid = placed.iter().filter(|p| !p.deforms);
-        for placed in rigid.chain(placed.iter().filter(|p| p.deforms)) {
-            if placed.deforms && self.loose_cells == 1 {
+        let rigid = placed.iter().filter(|p| !p.loose);
+        for placed in rigid.chain(placed.iter().filter(|p| p.loose)) {
+            if placed.loose && self.loose_cells == 1 {
                 self.loose_cells = self.truth.next_cell();
             }
             self.add_carrier(placed);
             progress("cells", self.points.len() as u64, total as u64);
         }
-        if !placed.iter().any(|p| p.deforms) {
+        if !placed.iter().any(|p| p.loose) {
             self.loose_cells = self.truth.next_cell();
         }
         self.occlusion = vec![255; self.points.len()];
@@ -311,7 +316,7 @@ impl World {
             self.slices.push(Slice {
                 instance: placed.instance,
                 points: slice_first..self.points.len() as u32,
-                cells: if placed.deforms { 0..0 } else { cells },
+                cells: if placed.loose { 0..0 } else { cells },
                 bounds: [Vec3::ZERO; 2],
                 local_bounds: [Vec3::ZERO; 2],
                 rays_done: 0,
@@ -321,10 +326,10 @@ impl World {
         self.carriers[placed.instance as usize] = Some(Carrier {
             points: first..self.points.len() as u32,
             slices: first_slice..self.slices.len() as u32,
-            deforms: placed.deforms,
+            loose: placed.loose,
             unplaced: false,
         });
-        if !placed.deforms {
+        if !self.scene.instances[placed.instance as usize].deforms {
             for slice in first_slice as usize..self.slices.len() {
                 let range = self.slices[slice].points.clone();
                 let positions = &self.mesh(placed.instance).positions;
@@ -463,7 +468,7 @@ impl World {
             let [after, before] = self.swept[instance];
             swept.push((number, [before[0].min(after[0]), before[1].max(after[1])]));
             if let Some(carrier) = &mut self.carriers[instance] {
-                carrier.unplaced |= carrier.deforms;
+                carrier.unplaced |= carrier.loose;
                 for slice in carrier.slices.clone() {
                     self.slices[slice as usize].stale = true;
                     self.slices[slice as usize].bounds = self.slice_bounds(slice as usize);
@@ -749,6 +754,15 @@ impl World {
         self.instance_of_bucket[bucket as usize]
     }
 
+    /// Positions and normals of an instance's vertices in the space that its grid is in.
+    pub fn grid_vertices(&self, instance: u32) -> (&[Vec3], &[Vec3]) {
+        if self.options.rest_space {
+            (&self.mesh(instance).positions, &self.mesh(instance).normals)
+        } else {
+            self.vertices(instance)
+        }
+    }
+
     /// The tracer, for pictures.
     pub fn tracer(&self) -> &dyn Tracer {
         &self.tracer
@@ -809,9 +823,7 @@ impl World {
             local_bounds,
             ..
         } = &self.slices[slice];
-        let deforms = self.carriers[*instance as usize]
-            .as_ref()
-            .is_some_and(|c| c.deforms);
+        let deforms = self.scene.instances[*instance as usize].deforms;
         let local = if deforms {
             let positions = self.vertices(*instance).0;
             bounds_of(self.local_positions(*instance, points.clone(), positions))
@@ -944,7 +956,8 @@ fn touches(a: [Vec3; 2], b: [Vec3; 2], reach: f32) -> bool {
 /// An instance's points, before they are in cells.
 struct Placed {
     instance: u32,
-    deforms: bool,
+    /// Its points will move through cells.
+    loose: bool,
     points: Vec<SurfacePoint>,
     placements: Vec<Option<Placement>>,
     grid: Instance,
@@ -1011,8 +1024,14 @@ fn place_points(
                     let points = &set.points[..count
                         .clamp(1, set.points.len().max(1))
                         .min(set.points.len())];
-                    let local_scale = scale_of(&pose.instances[instance as usize].world_from_local);
-                    place_instance(scene, deformed, options, instance, local_scale, points)
+                    // Rest space is as large as the pose makes it; local space as placed.
+                    let deforms = scene.instances[instance as usize].deforms;
+                    let scale = if deforms && !options.rest_space {
+                        scale_of(&pose.instances[instance as usize].world_from_local)
+                    } else {
+                        scale
+                    };
+                    place_instance(scene, deformed, options, instance, scale, points)
                 })
                 .collect();
             progress(
@@ -1041,9 +1060,9 @@ fn place_instance(
     scale: Vec3,
     points: &[SurfacePoint],
 ) -> Option<Placed> {
-    let deforms = scene.instances[instance as usize].deforms;
+    let loose = scene.instances[instance as usize].deforms && !options.rest_space;
     let mesh = &scene.meshes[scene.instances[instance as usize].mesh as usize];
-    let (positions, normals) = match deformed.iter().find(|d| d.instance == instance) {
+    let (positions, normals) = match deformed.iter().find(|d| loose && d.instance == instance) {
         Some(d) => (&d.positions, &d.normals),
         None => (&mesh.positions, &mesh.normals),
     };
@@ -1053,7 +1072,7 @@ fn place_instance(
         .collect();
     let bounds = bounds_of(local.iter().copied());
     // Room to move in before the first new grid.
-    let margin = if deforms {
+    let margin = if loose {
         (bounds[1] - bounds[0]) * 0.25
     } else {
         Vec3::ZERO
@@ -1085,7 +1104,7 @@ fn place_instance(
     let cells = cells.len();
     Some(Placed {
         instance,
-        deforms,
+        loose,
         points,
         placements,
         grid,

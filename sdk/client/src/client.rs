@@ -1,8 +1,9 @@
 //! The client's side of a stream: packets in, frames out.
 
-use crate::memory::Heap;
+use crate::memory::{Heap, SliceHeap};
 use psao_core::Mirror;
 use psao_core::mirror::Capacity;
+use psao_core::slices::apply_slices;
 use psao_core::stream::{
     CHANGES_HEADER_BYTES, FRAME_HEADER_BYTES, Frame, Header, MAX_BODY_BYTES, PACKET_HEADER_BYTES,
     PREAMBLE, Packet, Profile, Reader, Refusal, StreamError, apply_changes, flag, kind,
@@ -104,6 +105,8 @@ pub struct Stats {
     pub buckets: u64,
     /// Cells set.
     pub cells: u64,
+    /// Slices decoded (profile `residual`).
+    pub slices: u64,
 }
 
 /// Follows one stream. Memory is taken when the header comes, and never after.
@@ -112,6 +115,7 @@ pub struct Client {
     state: State,
     header: Option<Header>,
     mirror: Mirror<Heap>,
+    slices: SliceHeap,
     /// Bytes of a packet that is not whole yet.
     input: Vec<u8>,
     /// Decompressed content of a packet.
@@ -136,6 +140,7 @@ impl Client {
             state: State::Connecting,
             header: None,
             mirror: Mirror::new(Heap::new(Capacity::default())),
+            slices: SliceHeap::default(),
             input: Vec::new(),
             raw: Vec::new(),
             zstd: zstd::zstd_safe::DCtx::create(),
@@ -278,13 +283,16 @@ impl Client {
         }
         self.next_sequence = packet.sequence.wrapping_add(1);
         match packet.kind {
-            kind::FRAME => packet.check_flags(flag::SNAPSHOT | flag::LAST)?,
+            kind::FRAME | kind::SLICES => packet.check_flags(flag::SNAPSHOT | flag::LAST)?,
             kind::HEADER | kind::END | kind::REFUSE => packet.check_flags(0)?,
             _ => {}
         }
         match (packet.kind, self.header) {
             (kind::HEADER, None) => self.begin(Header::read(packet.body)?).map(|()| None),
             (kind::FRAME, Some(header)) => self.frame(&header, packet),
+            (kind::SLICES, Some(header)) if header.profile == Profile::Residual => {
+                self.frame(&header, packet)
+            }
             (kind::END, Some(_)) if self.open_frame.is_none() => {
                 if !packet.body.is_empty() {
                     return Err(StreamError::Length.into());
@@ -299,7 +307,7 @@ impl Client {
                 let printable = text.chars().filter(|c| !c.is_control());
                 Err(ClientError::Refused(refusal, printable.take(200).collect()))
             }
-            (kind::HEADER | kind::FRAME | kind::END | kind::REFUSE, _) => {
+            (kind::HEADER | kind::FRAME | kind::END | kind::REFUSE | kind::SLICES, _) => {
                 Err(StreamError::Order.into())
             }
             (_, None) => Err(StreamError::Order.into()),
@@ -317,12 +325,12 @@ impl Client {
         if self.config.scene_hash != 0 && self.config.scene_hash != header.scene_hash {
             return Err(ClientError::Scene(header.scene_hash));
         }
-        let Profile::Cells = header.profile;
         if self.mirror.capacity() != need {
             // The old one goes first, so that both are never held at once.
             self.mirror = Mirror::new(Heap::new(Capacity::default()));
             self.mirror = Mirror::new(Heap::new(need));
         }
+        self.slices = SliceHeap::new(header.slices, header.points);
         self.raw.resize(header.max_raw_bytes as usize, 0);
         self.header = Some(header);
         self.input.reserve_exact(self.packet_bytes());
@@ -352,12 +360,20 @@ impl Client {
         self.open_frame = (!last).then_some((frame.id, frame.time_ns));
         if snapshot {
             self.mirror.reset();
+            self.slices.slices().reset();
             self.in_snapshot = true;
         } else if self.state == State::Desynchronised && !self.in_snapshot {
             return Ok(None);
         }
         let raw_bytes = frame.raw_bytes as usize;
-        if raw_bytes > 0 {
+        if packet.kind == kind::SLICES {
+            if raw_bytes != compressed.len() {
+                return Err(StreamError::Length.into());
+            }
+            let slices = &mut self.slices.slices();
+            let count = apply_slices(compressed, header.step, &mut self.mirror, slices)?;
+            self.stats.slices += u64::from(count);
+        } else if raw_bytes > 0 {
             // zstd itself would go on behind the first frame, and skip what is none.
             if zstd::zstd_safe::find_frame_compressed_size(compressed) != Ok(compressed.len()) {
                 return Err(ClientError::Compression);
@@ -422,6 +438,7 @@ impl Client {
     /// Bytes of memory held: buffers, dirty sets, and the input and decompression buffers.
     pub fn memory_bytes(&self) -> u64 {
         self.mirror.capacity().bytes()
+            + self.slices.bytes()
             + self.input.capacity() as u64
             + self.raw.capacity() as u64
             + self.zstd.sizeof() as u64

@@ -22,6 +22,7 @@ pub mod mirror;
 pub mod point;
 pub mod range;
 pub mod residual;
+pub mod slices;
 pub mod stream;
 pub mod uplink;
 

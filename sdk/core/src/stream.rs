@@ -46,6 +46,9 @@ pub mod kind {
     pub const END: u8 = 3;
     /// The server will not serve. [`super::Refusal`].
     pub const REFUSE: u8 = 4;
+    /// A part of a frame's changes: occlusion of slices. [`super::Frame`], then
+    /// [`crate::slices`]' items. Profile `residual` only.
+    pub const SLICES: u8 = 5;
 }
 
 /// Flags of a packet.
@@ -130,6 +133,9 @@ pub enum Profile {
     /// The paper's (section 3.4): changed buckets and whole changed cells, zstd.
     #[default]
     Cells = 0,
+    /// Each cell once; after that only its points' occlusion, predicted and entropy coded, slice
+    /// by slice.
+    Residual = 1,
 }
 
 /// Parameters of a stream.
@@ -155,6 +161,12 @@ pub struct Header {
     pub rate_hz: f32,
     /// A point is sent again when its occlusion is off by more than this, in 1/255.
     pub threshold: u8,
+    /// Profile `residual`: occlusion changes in multiples of this many 1/255, 1 or more.
+    pub step: u8,
+    /// Profile `residual`: slices in all.
+    pub slices: u32,
+    /// Profile `residual`: points of all slices.
+    pub points: u32,
 }
 
 /// What every part of a frame says of it.
@@ -327,6 +339,7 @@ impl Header {
         let _minor = r.u16()?;
         let profile = match r.u8()? {
             0 => Profile::Cells,
+            1 => Profile::Residual,
             other => return Err(StreamError::Profile(other)),
         };
         let kernel = match r.u8()? {
@@ -345,8 +358,20 @@ impl Header {
         };
         let (max_body_bytes, max_raw_bytes) = (r.u32()?, r.u32()?);
         let (ao_distance_m, density, rate_hz) = (r.f32()?, r.f32()?, r.f32()?);
-        let threshold = r.u8()?;
-        if r.array::<3>()? != [0; 3] {
+        let (threshold, step) = (r.u8()?, r.u8()?);
+        if r.array::<2>()? != [0; 2] {
+            return Err(StreamError::Value);
+        }
+        let (slices, points) = (r.u32()?, r.u32()?);
+        let fits = match profile {
+            Profile::Cells => [u32::from(step), slices, points] == [0; 3],
+            // A slice has a cell, and a cell no more than its places.
+            Profile::Residual => {
+                let places = u64::from(capacity.cells).saturating_mul(CELL_POINTS as u64);
+                step > 0 && slices <= capacity.cells && u64::from(points) <= places
+            }
+        };
+        if !fits {
             return Err(StreamError::Value);
         }
         let in_range = (64..=MAX_BODY_BYTES).contains(&max_body_bytes)
@@ -368,6 +393,9 @@ impl Header {
             density,
             rate_hz,
             threshold,
+            step,
+            slices,
+            points,
         })
     }
 
@@ -395,7 +423,9 @@ impl Header {
         for value in [self.ao_distance_m, self.density, self.rate_hz] {
             w.f32(value)?;
         }
-        w.bytes(&[self.threshold, 0, 0, 0])
+        w.bytes(&[self.threshold, self.step, 0, 0])?;
+        w.u32(self.slices)?;
+        w.u32(self.points)
     }
 }
 
@@ -535,6 +565,19 @@ impl<'a> Reader<'a> {
         self.array().map(f64::from_le_bytes)
     }
 
+    /// A number in 1 to 5 bytes: 7 bits each, low ones first; the high bit says that more follow.
+    pub fn varint(&mut self) -> Result<u32, StreamError> {
+        let mut value = 0u64;
+        for shift in [0u32, 7, 14, 21, 28] {
+            let byte = self.u8()?;
+            value |= u64::from(byte & 127).wrapping_shl(shift);
+            if byte & 128 == 0 {
+                return u32::try_from(value).map_err(|_| StreamError::Value);
+            }
+        }
+        Err(StreamError::Value)
+    }
+
     fn list<T: Pod>(&mut self, count: u32) -> Result<List<'a, T>, StreamError> {
         let bytes = |each: usize| {
             (count as usize)
@@ -597,6 +640,15 @@ impl<'a> Writer<'a> {
     /// Eight bytes.
     pub fn u64(&mut self, value: u64) -> Result<(), StreamError> {
         self.bytes(&value.to_le_bytes())
+    }
+
+    /// A number as [`Reader::varint`] reads it.
+    pub fn varint(&mut self, mut value: u32) -> Result<(), StreamError> {
+        while value > 127 {
+            self.bytes(&[value as u8 | 128])?;
+            value >>= 7;
+        }
+        self.bytes(&[value as u8])
     }
 
     /// A float.
