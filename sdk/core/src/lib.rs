@@ -8,6 +8,7 @@
 //!   laid out as the client's GPU buffers hold it.
 //! * [`mirror`]: those buffers, their dirty ranges, and a hash that proves two mirrors equal.
 //! * [`stream`]: the packets of `docs/format.md`, reader and writer side by side.
+//! * [`residual`], over [`range`]: the coding of a slice's occlusion.
 //! * [`uplink`]: what the client tells the server.
 //! * [`lookup`]: the blend of the few points around a fragment; the definition for all shaders.
 //!
