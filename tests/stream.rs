@@ -14,7 +14,7 @@ use psao::core::stream::{
 };
 use psao::core::uplink::{self, Camera, Hello, MAX_UPLINK_BODY_BYTES, Message, Transform};
 use psao::{Client, ClientError, Config, State};
-use psao_server::encode::{Compression, Encoder, capacity_of, refusal};
+use psao_server::encode::{Compression, Encoder, Scheme, capacity_of, refusal};
 use psao_server::scene::{
     Animation, Channel, Interpolation, Keys, LocalTransform, Mesh, Morph, Node, Scene,
 };
@@ -33,6 +33,11 @@ struct Sample {
 }
 
 /// A floor, a box that moves over it and one that swells.
+const CELLS: Scheme = Scheme::Cells {
+    threshold: 2,
+    compression: Compression::Fast,
+};
+
 fn scene() -> Scene {
     let mut swelling = cuboid("swelling", Vec3::splat(0.4));
     let positions = swelling.positions.iter().map(|p| *p * 0.5).collect();
@@ -126,7 +131,7 @@ fn world(density: f64) -> World {
 /// What a server sends of [`scene`]: `frames` frames, a snapshot again at the fifth, and an end.
 fn serve(density: f64, frames: u32) -> Sample {
     let mut world = world(density);
-    let mut encoder = Encoder::new(&world.truth, 2, Compression::Fast);
+    let mut encoder = Encoder::new(&world, CELLS);
     let mut bytes = encoder.header(&world, world.scene.hash(), 30.0);
     let mut mirrors = HashMap::new();
     for frame in 0..frames {
@@ -1540,7 +1545,7 @@ fn a_hundred_thousand_damaged_messages_are_read_or_refused() {
 fn a_world_driven_to_absurd_places_goes_on() {
     // All of these are finite, and so get through the uplink.
     let mut world = world(24.0);
-    let mut encoder = Encoder::new(&world.truth, 2, Compression::Fast);
+    let mut encoder = Encoder::new(&world, CELLS);
     let mut bytes = encoder.header(&world, 0, 30.0);
     let mut client = Client::new(config(capacity_of(&world.truth)));
     let far = DAffine3::from_translation(glam::DVec3::splat(1e300));

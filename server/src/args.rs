@@ -1,7 +1,7 @@
 //! Options that several commands share: which scene, how sampled, how sent.
 
 use crate::camera::CameraPath;
-use crate::encode::Compression;
+use crate::encode::{Compression, Scheme};
 use crate::points::SurfacePoint;
 use crate::scene::{Placement, Scene};
 use crate::server::Settings;
@@ -9,6 +9,7 @@ use crate::world::{Options, Progress, World};
 use clap::{Args, ValueEnum};
 use glam::Vec3;
 use psao_core::Kernel;
+use psao_core::residual::Quantiser;
 use std::path::PathBuf;
 
 /// Which scene, and how it is sampled.
@@ -61,16 +62,41 @@ pub enum CompressionArg {
     Paper,
 }
 
+/// A stream profile by name.
+#[derive(ValueEnum, Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ProfileArg {
+    /// The paper's: whole changed cells, zstd
+    Cells,
+    /// Each cell once, then occlusion alone, predicted and entropy coded
+    Residual,
+}
+
+impl ProfileArg {
+    /// As on the command line.
+    pub fn name(self) -> &'static str {
+        match self {
+            ProfileArg::Cells => "cells",
+            ProfileArg::Residual => "residual",
+        }
+    }
+}
+
 /// How it is sent.
 #[derive(Args, Clone, Debug)]
 pub struct StreamArgs {
+    /// What is sent of a change
+    #[arg(long, value_enum, default_value_t = ProfileArg::Residual)]
+    pub profile: ProfileArg,
     /// Server frames per second
     #[arg(long, value_name = "HZ", default_value_t = 30.0)]
     pub fps: f32,
     /// Occlusion differences up to this many 1/255 are not sent
     #[arg(long, value_name = "N", default_value_t = 2)]
     pub threshold: u8,
-    /// How hard zstd tries
+    /// Occlusion changes in multiples of this many 1/255 (profile residual), 1 to 255
+    #[arg(long, value_name = "N", default_value_t = 3)]
+    pub step: u8,
+    /// How hard zstd tries (profile cells)
     #[arg(long, value_enum, default_value_t = CompressionArg::Fast)]
     pub compression: CompressionArg,
     /// The extended field of view reaches this much farther on every side, degrees
@@ -131,13 +157,21 @@ impl SceneArgs {
     ///
     /// # Errors
     /// What is wrong with a file or an option, and what to do.
-    pub fn world(&self, progress: Progress<'_>) -> Result<World, String> {
-        let options = self.options()?;
+    pub fn world(&self, rest_space: bool, progress: Progress<'_>) -> Result<World, String> {
+        let options = Options {
+            rest_space,
+            ..self.options()?
+        };
         World::new(self.load()?, options, progress).map_err(|error| error.to_string())
     }
 }
 
 impl StreamArgs {
+    /// The profile needs the points of deforming instances in rest space.
+    pub fn rest_space(&self) -> bool {
+        self.profile == ProfileArg::Residual
+    }
+
     /// How frames are made.
     ///
     /// # Errors
@@ -146,14 +180,25 @@ impl StreamArgs {
         if !(self.fps > 0.0 && self.fps <= 1000.0) {
             return Err("--fps must be above 0 and at most 1000".into());
         }
+        if self.step == 0 {
+            return Err("--step must be 1 to 255".into());
+        }
         if !(0.0..=180.0).contains(&self.margin) {
             return Err("--margin must be 0 to 180 degrees".into());
         }
         Ok(Settings {
-            threshold: self.threshold,
-            compression: match self.compression {
-                CompressionArg::Fast => Compression::Fast,
-                CompressionArg::Paper => Compression::Paper,
+            scheme: match self.profile {
+                ProfileArg::Cells => Scheme::Cells {
+                    threshold: self.threshold,
+                    compression: match self.compression {
+                        CompressionArg::Fast => Compression::Fast,
+                        CompressionArg::Paper => Compression::Paper,
+                    },
+                },
+                ProfileArg::Residual => Scheme::Residual(Quantiser {
+                    step: self.step,
+                    dead_zone: self.threshold,
+                }),
             },
             rate_hz: self.fps,
             margin_rad: self.margin.to_radians(),

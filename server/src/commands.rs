@@ -103,7 +103,7 @@ pub fn serve(args: &ServeArgs, progress: Progress<'_>) -> Result<(), String> {
     let settings = args.stream.settings()?;
     let identity = Identity::load_or_create(&args.identity).map_err(|e| e.to_string())?;
     let fingerprint = identity.fingerprint();
-    let world = args.scene.world(progress)?;
+    let world = args.scene.world(args.stream.rest_space(), progress)?;
     let mut server = Server::new(world, settings);
     let mut transport = Transport::start(TransportConfig {
         listen: args.listen,
@@ -149,7 +149,7 @@ pub fn serve(args: &ServeArgs, progress: Progress<'_>) -> Result<(), String> {
 /// What went wrong, and what to do about it.
 pub fn record(args: &RecordArgs, progress: Progress<'_>) -> Result<u64, String> {
     let settings = args.stream.settings()?;
-    let mut world = args.scene.world(progress)?;
+    let mut world = args.scene.world(args.stream.rest_space(), progress)?;
     let path = args
         .path
         .map(|which| camera_path(&world, which, 16.0 / 9.0))
@@ -166,7 +166,7 @@ pub fn record(args: &RecordArgs, progress: Progress<'_>) -> Result<u64, String> 
     let error = |error: std::io::Error| format!("{}: {error}", args.out.display());
     let temporary = args.out.with_extension("psao.part");
     let mut file = BufWriter::new(File::create(&temporary).map_err(error)?);
-    let mut encoder = Encoder::new(&world.truth, settings.threshold, settings.compression);
+    let mut encoder = Encoder::new(&world, settings.scheme);
     let scene_hash = world.scene.hash();
     let mut bytes = encoder.header(&world, scene_hash, settings.rate_hz);
     let mut total = 0;

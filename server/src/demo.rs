@@ -147,7 +147,7 @@ pub fn run(args: &DemoArgs, progress: Progress<'_>) -> Result<Figures, String> {
         return Err("--frames must be 1 or more".into());
     }
     let start = Instant::now();
-    let mut world = args.scene.world(progress)?;
+    let mut world = args.scene.world(args.stream.rest_space(), progress)?;
     let aspect = args.size.0 as f32 / args.size.1 as f32;
     let path = camera_path(&world, args.path, aspect)?;
     let time_of = |frame: u32| f64::from(frame) / f64::from(args.stream.fps);
@@ -171,7 +171,7 @@ pub fn run(args: &DemoArgs, progress: Progress<'_>) -> Result<Figures, String> {
         instances: world.scene.instances.len(),
         frames: args.frames,
         fps: args.stream.fps,
-        profile: "cells",
+        profile: args.stream.profile.name(),
         density: args.scene.density,
         kernel: format!("{:?}", world.options.kernel).to_lowercase(),
         mirror_matches: true,

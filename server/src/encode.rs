@@ -6,8 +6,12 @@
 
 use crate::truth::Truth;
 use crate::world::World;
-use psao::memory::Heap;
+use psao::memory::{Heap, SliceHeap};
 use psao_core::mirror::Capacity;
+use psao_core::residual::{
+    MAX_SLICE_BYTES, Neighbours, Quantiser, SLICE_POINTS, SliceState, encode_slice,
+};
+use psao_core::slices::{Item, Slice, Values, store};
 use psao_core::stream::{
     self, CHANGES_HEADER_BYTES, FRAME_HEADER_BYTES, Frame, Header, PACKET_HEADER_BYTES, PREAMBLE,
     Profile, StreamError, Writer, apply_changes, flag, kind, write_packet,
@@ -25,6 +29,21 @@ pub const POSITION_THRESHOLD: u32 = 1;
 /// A point is sent again when its normal is off by more than this (as a dot product; 11 degrees,
 /// one step of the code where it is coarsest).
 pub const NORMAL_THRESHOLD: f32 = 0.98;
+
+/// How a stream carries changes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Scheme {
+    /// Profile `cells`: whole cells, sent again when a point's occlusion is off by more than
+    /// `threshold` (1/255).
+    Cells {
+        /// Occlusion differences up to this many 1/255 are not sent.
+        threshold: u8,
+        /// How hard zstd tries.
+        compression: Compression,
+    },
+    /// Profile `residual`: each cell once, then its points' occlusion alone.
+    Residual(Quantiser),
+}
 
 /// How hard zstd tries.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -44,6 +63,8 @@ pub struct FrameStats {
     pub buckets: u32,
     /// Cells sent.
     pub cells: u32,
+    /// Slices sent (profile `residual`).
+    pub slices: u32,
     /// Bytes of the frame in the stream.
     pub bytes: u64,
 }
@@ -51,8 +72,11 @@ pub struct FrameStats {
 /// One client's view of the truth.
 pub struct Encoder {
     mirror: Mirror<Heap>,
-    threshold: u8,
-    compression: Compression,
+    scheme: Scheme,
+    /// Profile `residual`: all slices, and what the codec keeps of them.
+    runs: Vec<CellRun>,
+    run_of_cell: Vec<u32>,
+    slices: SliceHeap,
     /// Cells that may differ from the mirror; and buckets that the mirror has something in.
     due_cells: Vec<u64>,
     due_buckets: Vec<u64>,
@@ -64,17 +88,55 @@ pub struct Encoder {
     snapshot: bool,
 }
 
+/// A slice of profile `residual`: a run of cells with at most [`SLICE_POINTS`] points.
+#[derive(Clone, Debug)]
+struct CellRun {
+    /// The world's slice that opened the cells: decides visibility.
+    world_slice: u32,
+    cells: std::ops::Range<u32>,
+    /// The client has it.
+    open: bool,
+    /// Its occlusion may differ from the client's.
+    due: bool,
+}
+
 impl Encoder {
-    /// A client that has nothing. `threshold`: occlusion differences up to this many 1/255 are
-    /// not sent.
-    pub fn new(truth: &Truth, threshold: u8, compression: Compression) -> Encoder {
+    /// A client that has nothing.
+    ///
+    /// # Panics
+    /// For profile `residual` in a world that is not laid out in rest space.
+    pub fn new(world: &World, scheme: Scheme) -> Encoder {
+        let truth = &world.truth;
         let capacity = capacity_of(truth);
+        let mut runs = Vec::new();
+        let mut run_of_cell = Vec::new();
+        let mut slices = SliceHeap::default();
+        if let Scheme::Residual(_) = scheme {
+            assert!(
+                world.options.rest_space,
+                "profile residual needs points in rest space"
+            );
+            runs = cell_runs(world);
+            run_of_cell = vec![0; truth.cells.len()];
+            let mut points = 0;
+            for (index, run) in runs.iter().enumerate() {
+                let cells = run.cells.start as usize..run.cells.end as usize;
+                points += truth.cells[cells.clone()]
+                    .iter()
+                    .map(Cell::len)
+                    .sum::<usize>();
+                run_of_cell[cells].fill(index as u32);
+            }
+            slices = SliceHeap::new(runs.len() as u32, points as u32);
+        }
         let mut due_cells = vec![0; dirty::words(truth.cells.len())];
         dirty::mark_all(&mut due_cells, truth.cells.len());
         Encoder {
             mirror: Mirror::new(Heap::new(capacity)),
-            threshold,
-            compression,
+            scheme,
+            runs,
+            run_of_cell,
+            slices,
             send_cells: vec![0; due_cells.len()],
             due_cells,
             due_buckets: vec![0; dirty::words(truth.buckets.len())],
@@ -87,7 +149,7 @@ impl Encoder {
 
     /// The stream's first bytes.
     pub fn header(&mut self, world: &World, scene_hash: u64, rate_hz: f32) -> Vec<u8> {
-        let header = Header {
+        let mut header = Header {
             profile: Profile::Cells,
             kernel: world.options.kernel,
             scene_hash,
@@ -97,8 +159,18 @@ impl Encoder {
             ao_distance_m: world.options.ao_distance_m,
             density: world.options.density as f32,
             rate_hz,
-            threshold: self.threshold,
+            ..Header::default()
         };
+        match self.scheme {
+            Scheme::Cells { threshold, .. } => header.threshold = threshold,
+            Scheme::Residual(quantiser) => {
+                header.profile = Profile::Residual;
+                header.threshold = quantiser.bound();
+                header.step = quantiser.step;
+                header.slices = self.runs.len() as u32;
+                header.points = self.slices.slices().last.len() as u32;
+            }
+        }
         let mut out = PREAMBLE.to_vec();
         self.packet(&mut out, kind::HEADER, 0, 256, |w| header.write(w));
         out
@@ -110,6 +182,8 @@ impl Encoder {
         self.mirror.clear_dirty();
         let cells = self.mirror.capacity().cells as usize;
         dirty::mark_all(&mut self.due_cells, cells);
+        self.slices.slices().reset();
+        self.runs.iter_mut().for_each(|run| run.open = false);
         dirty::clear(
             &mut self.due_buckets,
             self.mirror.capacity().buckets as usize,
@@ -123,6 +197,9 @@ impl Encoder {
         for run in dirty::runs(cells, truth.cells.len()) {
             for cell in run {
                 dirty::mark(&mut self.due_cells, truth.cells.len(), cell);
+                if let Some(&run) = self.run_of_cell.get(cell) {
+                    self.runs[run as usize].due = true;
+                }
             }
         }
         for run in dirty::runs(buckets, truth.buckets.len()) {
@@ -146,41 +223,71 @@ impl Encoder {
         out: &mut Vec<u8>,
     ) -> FrameStats {
         let truth = &world.truth;
-        self.select(world, visible);
+        match self.scheme {
+            Scheme::Cells { threshold, .. } => self.select(world, visible, threshold),
+            Scheme::Residual(_) => self.select_new(world, visible),
+        }
         let instances: Vec<(u32, Instance)> = (0..truth.instances.len())
             .filter(|&i| self.mirror.instances()[i] != truth.instances[i])
             .map(|i| (i as u32, truth.instances[i]))
             .collect();
         let buckets: Vec<(u32, Bucket)> = elements(&self.send_buckets, &truth.buckets);
-        let cells: Vec<(u32, Cell)> = elements(&self.send_cells, &truth.cells);
+        let mut cells: Vec<(u32, Cell)> = elements(&self.send_cells, &truth.cells);
+        if let Scheme::Residual(_) = self.scheme {
+            // Where the points are; what they say follows.
+            for point in cells.iter_mut().flat_map(|(_, cell)| &mut cell.points) {
+                if point.is_allocated() {
+                    *point = point.with_occlusion(255);
+                }
+            }
+        }
         dirty::clear(&mut self.send_buckets, truth.buckets.len());
         dirty::clear(&mut self.send_cells, truth.cells.len());
         let mut stats = FrameStats {
             instances: instances.len() as u32,
             buckets: buckets.len() as u32,
             cells: cells.len() as u32,
-            bytes: 0,
+            ..FrameStats::default()
         };
-        let nothing = stats == FrameStats::default();
-        if nothing && !always && !self.snapshot {
-            return stats;
-        }
-        let contents = contents(&instances, &buckets, &cells);
+        let mut contents = if stats == FrameStats::default() {
+            Vec::new()
+        } else {
+            contents(&instances, &buckets, &cells)
+        };
         for content in &contents {
             // The same bytes and the same function as at the client; the server's own data
             // always applies.
             apply_changes(content, &mut self.mirror).expect("own changes apply to the mirror");
         }
+        let items = match self.scheme {
+            Scheme::Cells { .. } => Vec::new(),
+            Scheme::Residual(quantiser) => {
+                let (items, slices) = self.code_slices(world, visible, quantiser);
+                stats.slices = slices;
+                items
+            }
+        };
+        if contents.is_empty() && items.is_empty() {
+            if !always && !self.snapshot {
+                return stats;
+            }
+            contents.push(Vec::new());
+        }
         self.mirror.clear_dirty();
         self.frame_id += 1;
         let start = out.len();
-        self.write_frame(&contents, time_ns, out);
+        self.write_frame(&contents, &items, time_ns, out);
         stats.bytes = (out.len() - start) as u64;
         stats
     }
 
     /// Marks the cells and buckets to send.
-    fn select(&mut self, world: &World, visible: &(dyn Fn([glam::Vec3; 2]) -> bool + Sync)) {
+    fn select(
+        &mut self,
+        world: &World,
+        visible: &(dyn Fn([glam::Vec3; 2]) -> bool + Sync),
+        threshold: u8,
+    ) {
         let truth = &world.truth;
         let (cell_count, bucket_count) = (truth.cells.len(), truth.buckets.len());
         let mut check = Vec::new();
@@ -225,7 +332,7 @@ impl Encoder {
             if self.mirror.buckets()[home] != truth.buckets[home] {
                 dirty::mark(&mut self.send_buckets, bucket_count, home);
             }
-            if differs(want, have, self.threshold) {
+            if differs(want, have, threshold) {
                 dirty::mark(&mut self.send_cells, cell_count, cell as usize);
             }
         }
@@ -245,7 +352,7 @@ impl Encoder {
                     &truth.cells[cell as usize],
                     &self.mirror.cells()[cell as usize],
                 );
-                if differs(want, have, self.threshold) {
+                if differs(want, have, threshold) {
                     dirty::mark(&mut self.send_cells, cell_count, cell as usize);
                     dirty::unmark(&mut self.due_cells, cell_count, cell as usize);
                 }
@@ -253,33 +360,192 @@ impl Encoder {
         }
     }
 
-    fn write_frame(&mut self, contents: &[Vec<u8>], time_ns: u64, out: &mut Vec<u8>) {
-        let compression = self.compression;
+    /// Marks the cells of slices that are seen for the first time, and the buckets that name them.
+    fn select_new(&mut self, world: &World, visible: &(dyn Fn([glam::Vec3; 2]) -> bool + Sync)) {
+        let truth = &world.truth;
+        for run in self.runs.iter().filter(|run| !run.open) {
+            if visible(world.slices[run.world_slice as usize].bounds) {
+                for cell in run.cells.clone() {
+                    dirty::mark(&mut self.send_cells, truth.cells.len(), cell as usize);
+                    // A bucket may name cells that the client has not got: those are empty.
+                    let home = truth.home(cell) as usize;
+                    if self.mirror.buckets()[home] != truth.buckets[home] {
+                        dirty::mark(&mut self.send_buckets, truth.buckets.len(), home);
+                    }
+                }
+            }
+        }
+    }
+
+    /// Codes the visible slices that differ; their cells are in the mirror already. Returns the
+    /// contents of the packets and the number of slices.
+    fn code_slices(
+        &mut self,
+        world: &World,
+        visible: &(dyn Fn([glam::Vec3; 2]) -> bool + Sync),
+        quantiser: Quantiser,
+    ) -> (Vec<Vec<u8>>, u32) {
+        let seen: Vec<bool> = world
+            .slices
+            .iter()
+            .map(|slice| visible(slice.bounds))
+            .collect();
+        let mut due = Vec::new();
+        for (index, run) in self.runs.iter_mut().enumerate() {
+            let opens = !run.open;
+            if seen[run.world_slice as usize] && (opens || run.due) {
+                (run.open, run.due) = (true, false);
+                due.push((index as u32, opens));
+            }
+        }
+        let mut slices = self.slices.slices();
+        for &(index, opens) in &due {
+            if opens {
+                let run = &self.runs[index as usize];
+                let instance = world.slices[run.world_slice as usize].instance;
+                let count = run.cells.end - run.cells.start;
+                slices
+                    .open(&self.mirror, index, instance, run.cells.start, count)
+                    .expect("own slices open once");
+            }
+        }
+        // Slices are independent: coded side by side, taken over one after the other.
+        struct Work<'a> {
+            opens: bool,
+            slice: Slice,
+            neighbours: &'a [Neighbours],
+            last: Vec<i8>,
+        }
+        let mut work = Vec::new();
+        for &(index, opens) in &due {
+            let slice = slices.slices[index as usize];
+            let points =
+                slice.point_first as usize..(slice.point_first + slice.point_count) as usize;
+            work.push(Work {
+                opens,
+                slice,
+                neighbours: &slices.neighbours[points.clone()],
+                last: slices.last[points].to_vec(),
+            });
+        }
+        let mirror = &self.mirror;
+        let coded: Vec<Option<(Values, Vec<u8>)>> = work
+            .par_iter_mut()
+            .map(|work| {
+                let cells = work.slice.cell_first as usize
+                    ..(work.slice.cell_first + work.slice.cell_count) as usize;
+                let read =
+                    |cells: &[Cell]| Values::of(cells).expect("a slice's points are bounded");
+                let want = read(&world.truth.cells[cells.clone()]);
+                let mut have = read(&mirror.cells()[cells]);
+                let off = want
+                    .get()
+                    .iter()
+                    .zip(have.get())
+                    .map(|(w, h)| w.abs_diff(*h))
+                    .max();
+                if !work.opens && off.is_none_or(|off| off <= quantiser.dead_zone) {
+                    return None;
+                }
+                let mut bytes = vec![0; MAX_SLICE_BYTES];
+                let mut state = SliceState {
+                    value: have.get_mut(),
+                    last: &mut work.last,
+                };
+                let length = encode_slice(
+                    work.neighbours,
+                    quantiser,
+                    &mut state,
+                    want.get(),
+                    work.opens,
+                    &mut bytes,
+                )
+                .expect("a slice has the room asked for");
+                bytes.truncate(length);
+                Some((have, bytes))
+            })
+            .collect();
+        let lasts: Vec<(Slice, Vec<i8>)> = work
+            .iter_mut()
+            .map(|w| (w.slice, std::mem::take(&mut w.last)))
+            .collect();
+        let mut packets: Vec<Vec<u8>> = Vec::new();
+        let (mut next, mut count) = (0, 0);
+        for (((slice, last), coded), (index, opens)) in lasts.into_iter().zip(coded).zip(due) {
+            let Some((values, bytes)) = coded else {
+                continue;
+            };
+            store(&mut self.mirror, slice, values.get()).expect("own slices are in the mirror");
+            let points =
+                slice.point_first as usize..(slice.point_first + slice.point_count) as usize;
+            slices.last[points].copy_from_slice(&last);
+            let instance = world.slices[self.runs[index as usize].world_slice as usize].instance;
+            let item = Item {
+                index,
+                opens: opens.then_some([instance, slice.cell_first, slice.cell_count]),
+                bytes: &bytes,
+            };
+            let room = bytes.len() + 32;
+            if packets
+                .last()
+                .is_none_or(|packet| packet.len() + room > SLICES_BYTES)
+            {
+                packets.push(Vec::new());
+                next = 0;
+            }
+            let packet = packets.last_mut().expect("one was just made");
+            let start = packet.len();
+            packet.resize(start + room, 0);
+            let mut writer = Writer::new(&mut packet[start..]);
+            item.write(next, &mut writer)
+                .expect("an item has the room asked for");
+            let length = writer.length();
+            packet.truncate(start + length);
+            next = index + 1;
+            count += 1;
+        }
+        (packets, count)
+    }
+
+    fn write_frame(
+        &mut self,
+        contents: &[Vec<u8>],
+        items: &[Vec<u8>],
+        time_ns: u64,
+        out: &mut Vec<u8>,
+    ) {
+        let compression = match self.scheme {
+            Scheme::Cells { compression, .. } => compression,
+            // Each cell is sent once: worth the effort.
+            Scheme::Residual(_) => Compression::Paper,
+        };
         let compressed: Vec<Vec<u8>> = contents
             .par_iter()
             .map_init(|| compressor(compression), |zstd, raw| compress(zstd, raw))
             .collect();
-        let last = contents.len() - 1;
-        for (index, (raw, compressed)) in contents.iter().zip(&compressed).enumerate() {
+        let cells = contents.iter().zip(&compressed);
+        let cells = cells.map(|(raw, compressed)| (kind::FRAME, raw.len(), compressed));
+        let slices = items.iter().map(|items| (kind::SLICES, items.len(), items));
+        let packets: Vec<(u8, usize, &Vec<u8>)> = cells.chain(slices).collect();
+        for (index, (kind, raw_bytes, body)) in packets.iter().enumerate() {
             let mut flags = 0;
             let mut frame = Frame {
                 id: self.frame_id,
                 time_ns,
                 mirror_hash: 0,
-                raw_bytes: raw.len() as u32,
+                raw_bytes: *raw_bytes as u32,
             };
             if self.snapshot {
                 flags |= flag::SNAPSHOT;
                 self.snapshot = false;
             }
-            if index == last {
+            if index + 1 == packets.len() {
                 flags |= flag::LAST;
                 frame.mirror_hash = self.mirror.hash();
             }
-            let room = FRAME_HEADER_BYTES + compressed.len();
-            self.packet(out, kind::FRAME, flags, room, |w| {
+            self.packet(out, *kind, flags, FRAME_HEADER_BYTES + body.len(), |w| {
                 frame.write(w)?;
-                w.bytes(compressed)
+                w.bytes(body)
             });
         }
     }
@@ -314,6 +580,39 @@ impl Encoder {
     pub fn frame_id(&self) -> u32 {
         self.frame_id
     }
+}
+
+/// Largest content of a slices packet.
+const SLICES_BYTES: usize = 1 << 18;
+
+/// The world's slices, cut where one holds too many points (cells that it opened may hold points
+/// of the slices behind it).
+fn cell_runs(world: &World) -> Vec<CellRun> {
+    let mut runs = Vec::new();
+    for (index, slice) in world.slices.iter().enumerate() {
+        let (mut start, mut points) = (slice.cells.start, 0);
+        let mut cut = |start: u32, end: u32| {
+            if start < end {
+                let world_slice = index as u32;
+                runs.push(CellRun {
+                    world_slice,
+                    cells: start..end,
+                    open: false,
+                    due: true,
+                });
+            }
+        };
+        for cell in slice.cells.clone() {
+            let count = world.truth.cells[cell as usize].len();
+            if points + count > SLICE_POINTS {
+                cut(start, cell);
+                (start, points) = (cell, 0);
+            }
+            points += count;
+        }
+        cut(start, slice.cells.end);
+    }
+    runs
 }
 
 /// Room a mirror of the truth needs.
@@ -431,6 +730,9 @@ fn compressor(compression: Compression) -> CCtx<'static> {
 }
 
 fn compress(zstd: &mut CCtx<'_>, raw: &[u8]) -> Vec<u8> {
+    if raw.is_empty() {
+        return Vec::new();
+    }
     let mut out = Vec::with_capacity(compress_bound(raw.len()));
     zstd.compress2(&mut out, raw)
         .expect("zstd has the room it asked for");

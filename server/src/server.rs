@@ -1,7 +1,7 @@
 //! The server's frame, top to bottom: what clients say, the world's step, a frame a client.
 
 use crate::camera::{Camera, Frustum};
-use crate::encode::{Compression, Encoder, FrameStats, point_rmse};
+use crate::encode::{Encoder, FrameStats, Scheme, point_rmse};
 use crate::transport::{ClientId, Event, OwnedMessage, Transport};
 use crate::world::{StepStats, World};
 use glam::{Affine3A, DAffine3, DVec3, Vec3};
@@ -13,10 +13,8 @@ use std::time::Instant;
 /// How frames are made.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Settings {
-    /// Occlusion differences up to this many 1/255 are not sent.
-    pub threshold: u8,
-    /// How hard zstd tries.
-    pub compression: Compression,
+    /// How changes are carried.
+    pub scheme: Scheme,
     /// Frames a second: what the stream's header says.
     pub rate_hz: f32,
     /// The extended field of view reaches this much farther on every side, radians.
@@ -117,12 +115,7 @@ impl Server {
     /// A client has come; it has nothing yet.
     fn join(&mut self, id: ClientId) {
         tracing::info!("client {id:?} joined");
-        let Settings {
-            threshold,
-            compression,
-            ..
-        } = self.settings;
-        let encoder = Encoder::new(&self.world.truth, threshold, compression);
+        let encoder = Encoder::new(&self.world, self.settings.scheme);
         let viewer = Viewer {
             encoder,
             frustum: None,

@@ -207,14 +207,19 @@ pub fn store<M: Memory>(
             .cells()
             .get(index as usize)
             .ok_or(StreamError::Value)?;
+        let mut changed = 0;
         for point in cell
             .points
             .iter_mut()
             .take_while(|point| point.is_allocated())
         {
-            *point = point.with_occlusion(*values.next().ok_or(StreamError::Value)?);
+            let new = point.with_occlusion(*values.next().ok_or(StreamError::Value)?);
+            changed |= new.0 ^ point.0;
+            *point = new;
         }
-        mirror.set_cell(index, cell)?;
+        if changed != 0 {
+            mirror.set_cell(index, cell)?;
+        }
     }
     Ok(())
 }
