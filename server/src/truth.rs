@@ -6,6 +6,7 @@ use psao_core::cell::{BUCKET_ENTRIES, CELL_POINTS};
 use psao_core::grid::MAX_DIM;
 use psao_core::point::{encode_normal, encode_position};
 use psao_core::{Bucket, Cell, Instance, Point, dirty};
+use std::collections::HashSet;
 
 /// Where a point is stored: a cell and a place in it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -84,11 +85,52 @@ pub fn fit(bounds: [Vec3; 2], scale: Vec3, cell_m: f32, radius_over_cell: f32) -
         .then_some(grid)
 }
 
-/// Buckets for a number of cells: four times as many entries as cells, odd so that the strides of
-/// Eq. 1 and the bucket count share no power of two.
+/// Buckets for a number of cells: four times as many entries as cells, and no multiple of 2 nor of
+/// the factors 17 and 31 of Eq. 1, which would leave most buckets empty and others full.
 pub fn buckets_for(cells: usize) -> u32 {
-    ((4 * cells).div_ceil(BUCKET_ENTRIES) as u32).max(1) | 1
+    let mut buckets = ((4 * cells).div_ceil(BUCKET_ENTRIES) as u32).max(1);
+    while [2, 17, 31]
+        .iter()
+        .any(|&factor| buckets.is_multiple_of(factor))
+    {
+        buckets += 1;
+    }
+    buckets
 }
+
+/// Widens a grid a little if with that fewer of these cells find their bucket full. Where the
+/// strides of Eq. 1 and the bucket count nearly share a multiple, whole rows of cells meet in a few
+/// buckets, and half of a floor's points would have no room; another Dx and Dy break that.
+pub fn spread(grid: &mut Instance, cells: &HashSet<[u32; 3]>) {
+    let over = |grid: &Instance| {
+        let mut loads = vec![0usize; grid.bucket_count as usize];
+        for &cell in cells {
+            loads[(grid.bucket(cell) - grid.bucket_first) as usize] += 1;
+        }
+        let over = loads.iter().map(|load| load.saturating_sub(BUCKET_ENTRIES));
+        over.sum::<usize>()
+    };
+    let tight = *grid;
+    let mut least = usize::MAX;
+    for wider in 0..SPREAD_TRIES {
+        let [x, y, z] = tight.dims;
+        let dims = [(x + wider).min(MAX_DIM), (y + wider).min(MAX_DIM), z];
+        let tried = Instance { dims, ..tight };
+        let over = over(&tried);
+        if over < least {
+            (*grid, least) = (tried, over);
+        }
+        if least * SPREAD_GOOD <= cells.len() {
+            break;
+        }
+    }
+}
+
+/// Sizes that [`spread`] tries: most are good, and it takes the first that is.
+const SPREAD_TRIES: u32 = 64;
+
+/// One cell in so many may find its bucket full: more often than by chance (one in 7000).
+const SPREAD_GOOD: usize = 1000;
 
 /// The server's buckets and cells.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -398,6 +440,47 @@ mod tests {
         truth.regrid(0, grid());
         check(&truth, &HashMap::new());
         assert_eq!(truth.used_cells(), 0);
+    }
+
+    #[test]
+    fn flat_floors_and_walls_of_any_size_find_room_in_their_buckets() {
+        let mut widened = 0;
+        for width in (5..160).step_by(3) {
+            for depth in [4, 30, 88] {
+                for axis in 0..3 {
+                    let cells: HashSet<[u32; 3]> = (0..width * depth)
+                        .map(|i| {
+                            let mut cell = [i % width + 1, 1, i / width + 1];
+                            cell.swap(1, axis);
+                            cell
+                        })
+                        .collect();
+                    let dims = [0, 1, 2].map(|a| cells.iter().map(|c| c[a]).max().unwrap() + 2);
+                    let mut grid = Instance {
+                        dims,
+                        bucket_first: 70,
+                        bucket_count: buckets_for(cells.len()),
+                        ..grid()
+                    };
+                    spread(&mut grid, &cells);
+                    widened += u32::from(grid.dims != dims);
+                    let mut loads = HashMap::new();
+                    for &cell in &cells {
+                        *loads.entry(grid.bucket(cell)).or_insert(0) += 1;
+                    }
+                    let over = loads.values().map(|load: &usize| load.saturating_sub(8));
+                    let over = over.sum::<usize>();
+                    assert!(
+                        over * SPREAD_GOOD <= cells.len(),
+                        "{dims:?}: {over} have no room"
+                    );
+                }
+            }
+        }
+        assert!(
+            widened > 0,
+            "the test is meant to have sizes that are unlucky as they are"
+        );
     }
 
     #[test]

@@ -9,7 +9,7 @@ use crate::points::{PointError, SurfacePoint, generate, largest_radius, morton_o
 use crate::rays::{Against, CpuTracer, Deformed, TooManyTriangles, Tracer, offset_origin, reach};
 use crate::samples::{PointSamples, Samples};
 use crate::scene::{InstancePose, Mesh, Pose, Scene};
-use crate::truth::{Place, Placement, Truth, buckets_for, fit};
+use crate::truth::{Place, Placement, Truth, buckets_for, fit, spread};
 use glam::{Affine3A, DAffine3, Vec3, Vec3A};
 use psao_core::{Instance, Kernel};
 use rayon::prelude::*;
@@ -255,7 +255,6 @@ impl World {
         for placed in &placed {
             let mut grid = placed.grid;
             grid.bucket_first = buckets;
-            grid.bucket_count = buckets_for(placed.cells);
             buckets += grid.bucket_count;
             self.instance_of_bucket
                 .resize(buckets as usize, placed.instance);
@@ -528,14 +527,26 @@ impl World {
         let scale = scale_of(&self.pose.instances[instance as usize].world_from_local);
         let (cell_m, radius) = (self.options.cell_m(), 1.0 / self.options.cell_over_radius);
         // A pose that no grid fits (not finite, or flattened) leaves its points discarded.
-        if let Some(grid) = fit([min - margin, max + margin], scale, cell_m, radius) {
+        if let Some(mut grid) = fit([min - margin, max + margin], scale, cell_m, radius) {
+            let old = &self.truth.instances[instance as usize];
+            (grid.bucket_first, grid.bucket_count) = (old.bucket_first, old.bucket_count);
+            let placements = self.placements_in(&grid, instance, points.clone());
+            spread(&mut grid, &cells_of(&placements));
             self.truth.regrid(instance, grid);
             self.places[points.start as usize..points.end as usize].fill(Place::NONE);
         }
     }
 
     fn placements(&self, instance: u32, points: Range<u32>) -> Vec<Option<Placement>> {
-        let grid = &self.truth.instances[instance as usize];
+        self.placements_in(&self.truth.instances[instance as usize], instance, points)
+    }
+
+    fn placements_in(
+        &self,
+        grid: &Instance,
+        instance: u32,
+        points: Range<u32>,
+    ) -> Vec<Option<Placement>> {
         let triangles = &self.mesh(instance).triangles;
         let (positions, normals) = self.vertices(instance);
         self.points[points.start as usize..points.end as usize]
@@ -1027,7 +1038,7 @@ fn place_instance(
         Vec3::ZERO
     };
     let bounds = [bounds[0] - margin, bounds[1] + margin];
-    let grid = fit(
+    let mut grid = fit(
         bounds,
         scale,
         options.cell_m(),
@@ -1048,20 +1059,21 @@ fn place_instance(
             )
         })
         .collect();
-    let cells = placements
-        .iter()
-        .flatten()
-        .map(|at| at.cell)
-        .collect::<HashSet<_>>()
-        .len();
+    let cells = cells_of(&placements);
+    grid.bucket_count = buckets_for(cells.len());
+    spread(&mut grid, &cells);
     Some(Placed {
         instance,
         deforms,
         points,
         placements,
         grid,
-        cells,
+        cells: cells.len(),
     })
+}
+
+fn cells_of(placements: &[Option<Placement>]) -> HashSet<[u32; 3]> {
+    placements.iter().flatten().map(|at| at.cell).collect()
 }
 
 fn extent(mesh: &Mesh) -> Vec3 {
