@@ -10,13 +10,14 @@ use crate::world::Progress;
 use clap::Args;
 use glam::Vec3;
 use psao::quic::{Closed, Connect, Connection, Trust};
-use psao::{Client, Config, State};
+use psao::{Client, ClientError, Config, State};
+use psao_core::Cell;
 use psao_core::mirror::Capacity;
 use psao_core::stream::{
     Frame, Header, MAX_BODY_BYTES, PREAMBLE, Packet, Refusal, StreamError, flag, kind,
 };
 use std::fs::File;
-use std::io::{BufReader, BufWriter, Read, Write};
+use std::io::{BufWriter, Read, Write};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -63,7 +64,7 @@ pub struct RecordArgs {
     #[arg(long, value_name = "N", default_value_t = 60)]
     pub frames: u32,
     /// Which of the two camera paths to walk, 0 or 1; without it, everything is in view
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(0..=1))]
     pub path: Option<u32>,
 }
 
@@ -95,11 +96,11 @@ pub struct InspectArgs {
     pub file: PathBuf,
 }
 
-/// Runs a server.
+/// Runs a server. Where it listens, and what clients need to know of it, goes to `out`.
 ///
 /// # Errors
 /// What went wrong, and what to do about it.
-pub fn serve(args: &ServeArgs, progress: Progress<'_>) -> Result<(), String> {
+pub fn serve(args: &ServeArgs, out: &mut dyn Write, progress: Progress<'_>) -> Result<(), String> {
     let settings = args.stream.settings()?;
     let identity = Identity::load_or_create(&args.identity).map_err(|e| e.to_string())?;
     let fingerprint = identity.fingerprint();
@@ -114,9 +115,12 @@ pub fn serve(args: &ServeArgs, progress: Progress<'_>) -> Result<(), String> {
         capacity: capacity_of(&server.world.truth),
     })
     .map_err(|error| error.to_string())?;
-    println!("listening    {}", transport.local_addr());
-    println!("fingerprint  {fingerprint}");
-    println!("scene hash   {:016x}", server.scene_hash());
+    let (address, scene_hash) = (transport.local_addr(), server.scene_hash());
+    writeln!(
+        out,
+        "listening    {address}\nfingerprint  {fingerprint}\nscene hash   {scene_hash:016x}"
+    )
+    .map_err(|error| format!("standard output: {error}"))?;
 
     let period = Duration::from_secs_f32(1.0 / settings.rate_hz);
     let start = Instant::now();
@@ -148,6 +152,36 @@ pub fn serve(args: &ServeArgs, progress: Progress<'_>) -> Result<(), String> {
 /// # Errors
 /// What went wrong, and what to do about it.
 pub fn record(args: &RecordArgs, progress: Progress<'_>) -> Result<u64, String> {
+    if args.frames == 0 {
+        return Err("--frames must be 1 or more".into());
+    }
+    let error = |error: std::io::Error| {
+        let out = args.out.display();
+        format!("{out}: {error}: choose another place for the recording")
+    };
+    // First of all, so that nobody waits for a recording that cannot be kept.
+    if args.out.is_dir() {
+        return Err(error(std::io::ErrorKind::IsADirectory.into()));
+    }
+    let temporary = args.out.with_extension("psao.part");
+    let file = File::create(&temporary).map_err(error)?;
+    let recorded = record_to(file, args, progress, &error).and_then(|total| {
+        std::fs::rename(&temporary, &args.out).map_err(error)?;
+        Ok(total)
+    });
+    if recorded.is_err() {
+        // What is left of it is of no use; the first error is the one that matters.
+        let _ = std::fs::remove_file(&temporary);
+    }
+    recorded
+}
+
+fn record_to(
+    file: File,
+    args: &RecordArgs,
+    progress: Progress<'_>,
+    error: &dyn Fn(std::io::Error) -> String,
+) -> Result<u64, String> {
     let settings = args.stream.settings()?;
     let mut world = args.scene.world(args.stream.rest_space(), progress)?;
     let path = args
@@ -163,9 +197,7 @@ pub fn record(args: &RecordArgs, progress: Progress<'_>) -> Result<u64, String> 
     let report = |done, total| progress("first occlusion", done, total);
     world.converge(&|bounds| sees(&first, bounds), world.options.rays, &report);
 
-    let error = |error: std::io::Error| format!("{}: {error}", args.out.display());
-    let temporary = args.out.with_extension("psao.part");
-    let mut file = BufWriter::new(File::create(&temporary).map_err(error)?);
+    let mut file = BufWriter::new(file);
     let mut encoder = Encoder::new(&world, settings.scheme);
     let scene_hash = world.scene.hash();
     let mut bytes = encoder.header(&world, scene_hash, settings.rate_hz);
@@ -188,7 +220,6 @@ pub fn record(args: &RecordArgs, progress: Progress<'_>) -> Result<u64, String> 
     }
     let file = file.into_inner().map_err(|e| error(e.into_error()))?;
     file.sync_all().map_err(error)?;
-    std::fs::rename(&temporary, &args.out).map_err(error)?;
     Ok(total)
 }
 
@@ -206,32 +237,52 @@ pub type Table = Vec<(String, String)>;
 /// # Errors
 /// What went wrong, and what to do about it.
 pub fn play(args: &PlayArgs) -> Result<Table, String> {
-    // Half for cells, a quarter for buckets; the rest is dirty sets and instances.
-    let half = (args.max_memory.min(1 << 20) << 20) / 2 / 32;
-    let elements = u32::try_from(half).unwrap_or(u32::MAX);
-    let capacity = Capacity {
-        instances: 1 << 20,
-        buckets: elements / 2,
-        cells: elements,
-    };
+    let capacity = capacity_within(args.max_memory);
     let mut player = Player {
         client: Client::new(Config {
             capacity,
             scene_hash: 0,
         }),
+        frames: args.frames,
         first_ns: 0,
         last: Frame::default(),
         decode: Vec::new(),
     };
     match &args.fingerprint {
-        None => player.file(Path::new(&args.source), args.frames)?,
+        None => player.file(Path::new(&args.source))?,
         Some(fingerprint) => player.live(args, *fingerprint, capacity)?,
     }
     Ok(player.table())
 }
 
+/// Half for cells, a quarter for buckets; the rest is dirty sets and instances.
+fn capacity_within(mebibytes: u64) -> Capacity {
+    let cells = (mebibytes.min(1 << 20) << 20) / 2 / size_of::<Cell>() as u64;
+    let cells = u32::try_from(cells).unwrap_or(u32::MAX);
+    Capacity {
+        instances: 1 << 20,
+        buckets: cells / 2,
+        cells,
+    }
+}
+
+/// The least `--max-memory` whose [`capacity_within`] holds this.
+fn max_memory_for(needed: Capacity) -> u64 {
+    let cells = u64::from(needed.cells).max(u64::from(needed.buckets) * 2 + 1);
+    (cells * 2 * size_of::<Cell>() as u64).div_ceil(1 << 20)
+}
+
+fn unreadable(path: &Path, error: &std::io::Error) -> String {
+    format!(
+        "{}: {error}: give a file that `psao record` has written",
+        path.display()
+    )
+}
+
 struct Player {
     client: Client,
+    /// Stops after so many.
+    frames: Option<u64>,
     first_ns: u64,
     last: Frame,
     /// Milliseconds of decoding a frame.
@@ -239,18 +290,26 @@ struct Player {
 }
 
 impl Player {
-    fn file(&mut self, path: &Path, frames: Option<u64>) -> Result<(), String> {
+    fn file(&mut self, path: &Path) -> Result<(), String> {
         let error = |error: &dyn std::fmt::Display| format!("{}: {error}", path.display());
-        let mut file = BufReader::new(File::open(path).map_err(|e| error(&e))?);
+        let mut file = File::open(path).map_err(|error| {
+            let is_address = path.to_str().is_some_and(|text| text.contains(':'));
+            unreadable(path, &error)
+                + if is_address {
+                    "; a server needs --fingerprint"
+                } else {
+                    ""
+                }
+        })?;
         let mut chunk = vec![0; 1 << 16];
-        while self.wants_more(frames) {
+        while self.wants_more() {
             let count = file.read(&mut chunk).map_err(|e| error(&e))?;
             if count == 0 {
                 break;
             }
             self.push(&chunk[..count], |_| ()).map_err(|e| error(&e))?;
         }
-        if self.client.state() != State::Ended && frames.is_none() {
+        if self.client.state() != State::Ended && self.wants_more() {
             return Err(error(
                 &"the recording breaks off: it was not written to its end",
             ));
@@ -274,7 +333,7 @@ impl Player {
         })
         .map_err(|error| error.to_string())?;
         let mut received = Vec::new();
-        while self.wants_more(args.frames) {
+        while self.wants_more() {
             received.clear();
             match connection.receive_timeout(&mut received, Duration::from_secs(1)) {
                 Ok(_) => {}
@@ -293,16 +352,24 @@ impl Player {
         Ok(())
     }
 
-    fn wants_more(&self, frames: Option<u64>) -> bool {
+    fn wants_more(&self) -> bool {
         self.client.state() != State::Ended
-            && frames.is_none_or(|frames| self.client.stats().frames < frames)
+            && self
+                .frames
+                .is_none_or(|frames| self.client.stats().frames < frames)
     }
 
     fn push(&mut self, bytes: &[u8], completed: impl Fn(&Frame)) -> Result<(), String> {
         let mut rest = bytes;
         let mut start = Instant::now();
-        while !rest.is_empty() {
-            let pushed = self.client.push(rest).map_err(|error| error.to_string())?;
+        while !rest.is_empty() && self.wants_more() {
+            let pushed = self.client.push(rest).map_err(|error| match error {
+                ClientError::Capacity(needed) => format!(
+                    "the stream needs a larger mirror: give --max-memory {}",
+                    max_memory_for(needed)
+                ),
+                other => other.to_string(),
+            })?;
             rest = &rest[pushed.consumed..];
             if let Some(frame) = pushed.frame {
                 if self.client.stats().frames == 1 {
@@ -362,7 +429,7 @@ impl Player {
 /// The file is no recording, or is damaged (where).
 pub fn inspect(args: &InspectArgs, out: &mut dyn Write) -> Result<(), String> {
     let name = args.file.display();
-    let bytes = std::fs::read(&args.file).map_err(|error| format!("{name}: {error}"))?;
+    let bytes = std::fs::read(&args.file).map_err(|error| unreadable(&args.file, &error))?;
     let at = |rest: &[u8]| bytes.len() - rest.len();
     let fail = |rest: &[u8], error: &dyn std::fmt::Display| {
         format!("{name}: at byte {}: {error}", at(rest))

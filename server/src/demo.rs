@@ -19,7 +19,7 @@ use psao::{Client, Config};
 use psao_core::mirror::Buffer;
 use serde::Serialize;
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 /// Options of `psao demo`.
@@ -41,7 +41,12 @@ pub struct DemoArgs {
     #[arg(long, value_name = "WxH", default_value = "480x270", value_parser = parse_size)]
     pub size: (usize, usize),
     /// Which of the two camera paths to walk, 0 or 1
-    #[arg(long, value_name = "N", default_value_t = 0)]
+    #[arg(
+        long,
+        value_name = "N",
+        default_value_t = 0,
+        value_parser = clap::value_parser!(u32).range(0..=1)
+    )]
     pub path: u32,
     /// Folder for the pictures and report.html
     #[arg(long, value_name = "DIR", default_value = "out")]
@@ -145,6 +150,14 @@ pub fn run(args: &DemoArgs, progress: Progress<'_>) -> Result<Figures, String> {
     let settings = args.stream.settings()?;
     if args.frames == 0 {
         return Err("--frames must be 1 or more".into());
+    }
+    // First of all, so that nobody waits for a report that cannot be kept.
+    let json_folder = args.json.as_deref().and_then(Path::parent);
+    let mut folders = vec![(&args.out, args.out.as_path())];
+    folders.extend(args.json.as_ref().zip(json_folder));
+    for (path, folder) in folders {
+        std::fs::create_dir_all(folder)
+            .map_err(|error| format!("{}: {error}: choose another place for it", path.display()))?;
     }
     let start = Instant::now();
     let mut world = args.scene.world(args.stream.rest_space(), progress)?;

@@ -5,6 +5,7 @@ use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
 use psao_server::commands::{self, InspectArgs, PlayArgs, RecordArgs, ServeArgs};
 use psao_server::demo::{self, DemoArgs};
 use std::collections::HashMap;
+use std::io::Write;
 use std::process::ExitCode;
 use std::sync::Mutex;
 
@@ -41,18 +42,26 @@ fn main() -> ExitCode {
     let result = match &cli.command {
         Command::Demo(args) => demo::run(args, &progress).map(|figures| {
             bars.finish();
-            print_table(&figures.table());
             let report = args.out.join("report.html");
-            println!("\nReport and pictures: {}", report.display());
+            let report = format!("\nReport and pictures: {}\n", report.display());
+            table(&figures.table()) + &report
         }),
-        Command::Serve(args) => commands::serve(args, &progress),
+        Command::Serve(args) => {
+            commands::serve(args, &mut std::io::stdout(), &progress).map(|()| String::new())
+        }
         Command::Record(args) => commands::record(args, &progress).map(|bytes| {
             bars.finish();
-            println!("{}: {bytes} bytes", args.out.display());
+            format!("{}: {bytes} bytes\n", args.out.display())
         }),
-        Command::Play(args) => commands::play(args).map(|table| print_table(&table)),
-        Command::Inspect(args) => commands::inspect(args, &mut std::io::stdout().lock()),
+        Command::Play(args) => commands::play(args).map(|rows| table(&rows)),
+        Command::Inspect(args) => {
+            commands::inspect(args, &mut std::io::stdout().lock()).map(|()| String::new())
+        }
     };
+    let result = result.and_then(|text| {
+        let written = std::io::stdout().write_all(text.as_bytes());
+        written.map_err(|error| format!("standard output: {error}"))
+    });
     match result {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
@@ -63,11 +72,12 @@ fn main() -> ExitCode {
     }
 }
 
-fn print_table(rows: &[(String, String)]) {
+fn table(rows: &[(String, String)]) -> String {
     let width = rows.iter().map(|(what, _)| what.len()).max().unwrap_or(0);
-    for (what, value) in rows {
-        println!("{what:width$}  {value}");
-    }
+    let lines = rows.iter();
+    lines
+        .map(|(what, value)| format!("{what:width$}  {value}\n"))
+        .collect()
 }
 
 /// One progress bar a stage; where standard error is no terminal, a line a stage.

@@ -444,6 +444,33 @@ mod tests {
     }
 
     #[test]
+    fn flat_floors_and_walls_of_any_size_find_room_in_their_buckets() {
+        for width in (5..160).step_by(3) {
+            for depth in [4, 30, 88] {
+                for axis in 0..3 {
+                    let cells: Vec<[u32; 3]> = (0..width * depth)
+                        .map(|i| {
+                            let mut cell = [i % width + 1, 1, i / width + 1];
+                            cell.swap(1, axis);
+                            cell
+                        })
+                        .collect();
+                    let dims = [0, 1, 2].map(|a| cells.iter().map(|c| c[a]).max().unwrap() + 2);
+                    let mut grid = Instance { dims, ..grid() };
+                    grid.bucket_count = choose_buckets(&grid, &cells, buckets_for(cells.len()));
+                    let mut loads = HashMap::new();
+                    for &cell in &cells {
+                        *loads.entry(grid.bucket(cell)).or_insert(0) += 1;
+                    }
+                    let over = loads.values().map(|load: &usize| load.saturating_sub(8));
+                    let over = over.sum::<usize>();
+                    assert!(over * 1000 <= cells.len(), "{dims:?}: {over} have no room");
+                }
+            }
+        }
+    }
+
+    #[test]
     fn a_lookup_finds_every_stored_point() {
         let mut truth = Truth::new(vec![grid()], 100);
         let position = Vec3::new(1.3, 2.2, 0.9);
