@@ -11,7 +11,7 @@ use psao_core::mirror::Capacity;
 use psao_core::residual::{
     MAX_SLICE_BYTES, Neighbours, Quantiser, SLICE_POINTS, SliceState, encode_slice,
 };
-use psao_core::slices::{Item, Slice, Values, store};
+use psao_core::slices::{FIRST, Item, Slice, Values, store};
 use psao_core::stream::{
     self, CHANGES_HEADER_BYTES, FRAME_HEADER_BYTES, Frame, Header, PACKET_HEADER_BYTES, PREAMBLE,
     Profile, StreamError, Writer, apply_changes, flag, kind, write_packet,
@@ -447,6 +447,7 @@ impl Encoder {
                 if !work.opens && off.is_none_or(|off| off <= quantiser.dead_zone) {
                     return None;
                 }
+                let quantiser = if work.opens { FIRST } else { quantiser };
                 let mut bytes = vec![0; MAX_SLICE_BYTES];
                 let mut state = SliceState {
                     value: have.get_mut(),

@@ -11,9 +11,18 @@
 
 use crate::cell::Cell;
 use crate::mirror::{Memory, Mirror};
-use crate::residual::{Neighbours, SLICE_POINTS, SliceState, decode_slice, find_neighbours};
+use crate::residual::{
+    Neighbours, Quantiser, SLICE_POINTS, SliceState, decode_slice, find_neighbours,
+};
 use crate::stream::{Reader, StreamError, Writer};
 use bytemuck::{Pod, Zeroable};
+
+/// How a slice is coded the first time: exactly. What stands still stays exact from then on, and
+/// beside the cells that come along the bits are few.
+pub const FIRST: Quantiser = Quantiser {
+    step: 1,
+    dead_zone: 0,
+};
 
 /// A slice that has been opened.
 #[repr(C)]
@@ -258,6 +267,7 @@ pub fn apply_slices<M: Memory>(
             value: values.get_mut(),
             last,
         };
+        let step = if first { FIRST.step } else { step };
         decode_slice(neighbours, step, &mut state, first, bytes)?;
         store(mirror, slice, values.get())?;
         count = count.saturating_add(1);
