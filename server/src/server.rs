@@ -183,7 +183,8 @@ impl Server {
     /// A frame for each client that can take one. Twice a second also one without changes, so that
     /// the client knows that it is up to date.
     fn encode(&mut self, ready: impl Fn(ClientId) -> bool) -> Vec<(ClientId, FrameStats, Vec<u8>)> {
-        let beat = self.frames % (f64::from(self.settings.rate_hz) / 2.0).max(1.0) as u64 == 0;
+        let every = (f64::from(self.settings.rate_hz) / 2.0).max(1.0) as u64;
+        let beat = self.frames.is_multiple_of(every);
         let mut frames = Vec::new();
         for (&id, viewer) in &mut self.viewers {
             // A busy client loses nothing: the next frame holds what this one would have.

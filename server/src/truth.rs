@@ -69,6 +69,10 @@ pub fn fit(bounds: [Vec3; 2], scale: Vec3, cell_m: f32, radius_over_cell: f32) -
     let cells_per_unit = scale / cell_m;
     let origin = bounds[0] - 1.0 / cells_per_unit;
     let extent = (bounds[1] - origin) * cells_per_unit;
+    let tellable = extent.is_finite() && extent.max_element() < (MAX_DIM - 2) as f32;
+    if !tellable {
+        return None;
+    }
     let inverse = 1.0 / cells_per_unit;
     let dims = extent.to_array().map(|cells| cells.floor() as u32 + 2);
     let grid = Instance {
@@ -80,8 +84,7 @@ pub fn fit(bounds: [Vec3; 2], scale: Vec3, cell_m: f32, radius_over_cell: f32) -
         normal_scale: (inverse / inverse.max_element()).to_array(),
         ..Instance::default()
     };
-    (extent.is_finite() && extent.max_element() < (MAX_DIM - 2) as f32 && grid.validate(1).is_ok())
-        .then_some(grid)
+    grid.validate(1).is_ok().then_some(grid)
 }
 
 /// Buckets for a number of cells: four times as many entries as cells, odd so that the strides of

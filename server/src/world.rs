@@ -377,11 +377,13 @@ impl World {
         if let Ok(tracer) = CpuTracer::new(&self.scene, &self.pose, &self.deformed, &self.moves) {
             self.tracer = tracer;
         }
-        let reach = self.options.ao_distance_m;
+        let (reach, words) = (self.options.ao_distance_m, self.words());
         for slice in &mut self.slices {
             if slice.instance == instance || touches(slice.bounds, bounds, reach) {
                 slice.rays_done = 0;
                 slice.stale = true;
+                let points = slice.points.start as usize..slice.points.end as usize;
+                self.fixed[points.start * words..points.end * words].fill(0);
             }
         }
     }
@@ -389,7 +391,8 @@ impl World {
     /// Advances to a time and brings the points of all `visible` slices up to date.
     ///
     /// `visible` is asked with world bounds relative to the scene's origin. `converge_rays` bounds
-    /// the rays spent on slices that have not reached all their rays; 0 for none.
+    /// the rays spent on slices that have not reached all their rays, beyond one such slice; 0 for
+    /// none at all.
     pub fn step(
         &mut self,
         time_s: f64,
@@ -592,8 +595,9 @@ impl World {
                     (rays * 2).max(FIRST_RAYS).min(all)
                 };
                 let cost = (next - rays) as u64 * points;
-                if cost <= budget {
-                    budget -= cost;
+                // The first one may cost more, so that small budgets get there too.
+                if cost <= budget || budget == converge_rays && budget > 0 {
+                    budget = budget.saturating_sub(cost);
                     rays = next;
                 }
                 stats.converging += u64::from(rays < goal.min(all));
@@ -995,6 +999,19 @@ fn place_points(
             .or_default()
             .push((index as u32, scale));
     }
+    // Before memory is taken for any of them; a mask's holes are not known yet.
+    let mut count = 0.0;
+    for ((mesh, _), users) in &sets {
+        let mesh = &scene.meshes[*mesh as usize];
+        let sides = if mesh.double_sided { 2.0 } else { 1.0 };
+        for (_, scale) in users {
+            let on_side = area(&mesh.triangles, &mesh.positions, *scale) * options.density;
+            count += sides * on_side.max(1.0);
+        }
+    }
+    if options.density.is_finite() && count > MAX_POINTS as f64 {
+        return Err(WorldError::TooManyPoints(count as u64));
+    }
     let done = std::sync::atomic::AtomicU64::new(0);
     let total = sets.len() as u64;
     // Large meshes first, so that none is left for the end alone.
@@ -1014,7 +1031,7 @@ fn place_points(
                 mesh,
                 largest,
                 options.density,
-                options.seed + u64::from(*mesh_index),
+                options.seed.wrapping_add(u64::from(*mesh_index)),
             )?;
             let placed = users
                 .par_iter()
@@ -1044,10 +1061,6 @@ fn place_points(
         .collect::<Result<_, PointError>>()?;
     let mut placed: Vec<Placed> = placed.into_iter().flatten().collect();
     placed.sort_by_key(|p| p.instance);
-    let count = placed.iter().map(|p| p.points.len() as u64).sum();
-    if count > MAX_POINTS {
-        return Err(WorldError::TooManyPoints(count));
-    }
     Ok(placed)
 }
 

@@ -467,7 +467,7 @@ fn a_bad_option_or_file_is_refused_in_words_and_leaves_nothing() {
         (&["--density", "nan"], &["--density", "above 0"]),
         (
             &["--density", "1e9"],
-            &["square metres", "1000000000", "lower --density"],
+            &["points, more than", "lower --density"],
         ),
         (&["--rays", "0"], &["--rays", "1 to 4096"]),
         (&["--rays", "4097"], &["--rays", "1 to 4096"]),

@@ -1,0 +1,442 @@
+//! What the world promises: the same result however it is reached, and nothing done in vain.
+
+#[path = "../../tests/small_scene.rs"]
+mod small_scene;
+
+use glam::{DAffine3, DVec3, Vec3};
+use psao_core::{Bucket, Cell, Kernel};
+use psao_server::encode::{Compression, Encoder};
+use psao_server::points::PointError;
+use psao_server::scene::Scene;
+use psao_server::world::{Options, World, WorldError};
+use small_scene::{MOVER, POST, SHEET, STILL, small_scene, still_scene};
+use std::collections::BTreeMap;
+
+fn options(density: f64, rays: usize) -> Options {
+    Options {
+        density,
+        rays,
+        ..Options::of(Kernel::Planar)
+    }
+}
+
+fn world(scene: Scene, options: Options) -> World {
+    World::new(scene, options, &|_, _, _| ()).unwrap()
+}
+
+fn all(_: [Vec3; 2]) -> bool {
+    true
+}
+
+fn converge(world: &mut World) {
+    world.converge(&all, &|_, _, _| ());
+}
+
+/// A world that has seen no other pose than this one.
+fn fresh(scene: &Scene, options: &Options, time_s: f64) -> World {
+    let mut world = world(scene.clone(), options.clone());
+    world.step(time_s, &all, 0);
+    converge(&mut world);
+    world
+}
+
+/// An instance's points by cell, in no order within one.
+fn points(world: &World, instance: u32) -> BTreeMap<u32, Vec<u32>> {
+    let grid = &world.truth.instances[instance as usize];
+    let buckets = grid.bucket_first..grid.bucket_first + grid.bucket_count;
+    let mut cells = BTreeMap::new();
+    for bucket in buckets {
+        for cell in world.truth.buckets[bucket as usize].cells() {
+            let cell = &world.truth.cells[cell as usize];
+            let mut points: Vec<u32> = cell.points[..cell.len()].iter().map(|p| p.0).collect();
+            points.sort();
+            cells.insert(cell.key, points);
+        }
+    }
+    cells
+}
+
+/// Both say the same: to the bit for what stands, and up to a ray for few points of what moves
+/// and is rigid (rays against itself were traced in another pose, and may graze an edge on the
+/// other side).
+fn assert_same(a: &World, b: &World) {
+    for (index, instance) in a.scene.instances.iter().enumerate() {
+        let name = format!("{index} {}", instance.name);
+        let (a_cells, b_cells) = (points(a, index as u32), points(b, index as u32));
+        let values = |cells: &BTreeMap<u32, Vec<u32>>| -> Vec<u32> {
+            cells.values().flatten().copied().collect()
+        };
+        let (a_points, b_points) = (values(&a_cells), values(&b_cells));
+        if a.truth.instances[index] != b.truth.instances[index] {
+            // Where something bends, its grid depends on where it has been, and with it which
+            // points have no room; what the others say does not.
+            assert!(instance.deforms, "{name}: another grid");
+            let mut more = [0i32; 256];
+            a_points
+                .iter()
+                .for_each(|point| more[(point & 0xff) as usize] += 1);
+            b_points
+                .iter()
+                .for_each(|point| more[(point & 0xff) as usize] -= 1);
+            let other = more
+                .iter()
+                .map(|more| more.unsigned_abs() as usize)
+                .sum::<usize>();
+            let discarded = a.discarded() + b.discarded();
+            assert!(discarded < 20, "{name}: {discarded} discarded");
+            assert!(other <= discarded, "{name}: {other} values differ");
+            continue;
+        }
+        assert!(a_cells.keys().eq(b_cells.keys()), "{name}: other cells");
+        assert_eq!(a_points.len(), b_points.len(), "{name}: number of points");
+        let ray = 255 / a.options.rays as u32 + 1;
+        let off = |a: u32, b: u32| match a >> 8 == b >> 8 {
+            true => (a & 0xff).abs_diff(b & 0xff),
+            false => 255,
+        };
+        let pairs = a_points.iter().zip(&b_points);
+        let off: Vec<u32> = pairs
+            .map(|(a, b)| off(*a, *b))
+            .filter(|&off| off > 0)
+            .collect();
+        let most = off.iter().max().copied().unwrap_or(0);
+        let few = if !instance.deforms && (instance.moves || index as u32 == STILL) {
+            1 + a_points.len() / 100
+        } else {
+            0
+        };
+        let (count, all) = (off.len(), a_points.len());
+        assert!(
+            count <= few && most <= ray,
+            "{name}: {count} of {all} points differ, by up to {most}"
+        );
+    }
+}
+
+/// Buckets and cells are compact, nothing is named twice, and every point is there or discarded.
+fn assert_sound(world: &World) {
+    let truth = &world.truth;
+    let mut named = vec![0; truth.cells.len()];
+    let mut keys = std::collections::HashSet::new();
+    for (index, bucket) in truth.buckets.iter().enumerate() {
+        let used = bucket.entries.iter().filter(|&&cell| cell != 0).count();
+        assert_eq!(
+            bucket.cells().count(),
+            used,
+            "an empty entry before a used one"
+        );
+        let instance = world.instance_of_bucket(index as u32);
+        for cell in bucket.cells() {
+            named[cell as usize] += 1;
+            assert_eq!(truth.home(cell), index as u32);
+            let key = truth.cells[cell as usize].key;
+            assert!(
+                keys.insert((instance, key)),
+                "{instance} has cell {key} twice"
+            );
+        }
+    }
+    let mut stored = 0;
+    for (cell, data) in truth.cells.iter().enumerate() {
+        let used = data
+            .points
+            .iter()
+            .filter(|point| point.is_allocated())
+            .count();
+        assert_eq!(data.len(), used, "an empty place before a used one");
+        assert_eq!(
+            named[cell],
+            i32::from(!data.is_empty()),
+            "cell {cell} is named"
+        );
+        stored += used;
+    }
+    assert_eq!(stored + world.discarded(), world.point_count());
+    assert_eq!(
+        truth.used_cells() as usize,
+        named.iter().filter(|&&n| n == 1).count()
+    );
+}
+
+#[test]
+fn points_truth_and_stream_are_the_same_on_any_number_of_threads() {
+    let run = |scene: Scene, threads: usize| -> (Vec<Bucket>, Vec<Cell>, Vec<u8>) {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads);
+        pool.build().unwrap().install(|| {
+            let mut world = world(scene, options(64.0, 64));
+            converge(&mut world);
+            let mut encoder = Encoder::new(&world.truth, 2, Compression::Fast);
+            let mut bytes = encoder.header(&world, world.scene.hash(), 30.0);
+            for frame in 0..4 {
+                world.step(f64::from(frame) * 0.1, &all, u64::MAX);
+                encoder.merge(&world.truth);
+                world.truth.clear_changes();
+                encoder.frame(&world, 0, &all, true, &mut bytes);
+            }
+            (world.truth.buckets, world.truth.cells, bytes)
+        })
+    };
+    for scene in [small_scene(), Scene::atrium()] {
+        let once = run(scene.clone(), 2);
+        assert!(once == run(scene.clone(), 2), "{}: twice", scene.name);
+        assert!(
+            once == run(scene.clone(), 1),
+            "{}: 1 and 2 threads",
+            scene.name
+        );
+    }
+}
+
+#[test]
+fn a_still_scene_costs_no_ray_and_no_byte_once_it_has_converged() {
+    let mut world = world(still_scene(), options(256.0, 64));
+    let mut encoder = Encoder::new(&world.truth, 0, Compression::Fast);
+    let (mut rays, mut bytes) = (Vec::new(), Vec::new());
+    for frame in 0..6 {
+        let step = world.step(f64::from(frame), &all, u64::MAX);
+        encoder.merge(&world.truth);
+        world.truth.clear_changes();
+        let mut stream = Vec::new();
+        let stats = encoder.frame(&world, 0, &all, false, &mut stream);
+        assert_eq!(stats.bytes, stream.len() as u64);
+        assert!(step.rays_if_all > 0);
+        rays.push(step.rays);
+        bytes.push(stats.bytes);
+    }
+    assert!(rays[0] > 0 && bytes[0] > 0);
+    assert_eq!(rays[1..], [0; 5]);
+    assert_eq!(bytes[1..], [0; 5]);
+}
+
+#[test]
+fn converging_within_a_budget_ends_where_converging_at_once_does() {
+    let options = options(128.0, 200);
+    let at_once = fresh(&small_scene(), &options, 0.0);
+    let mut slowly = world(small_scene(), options);
+    let mut steps = 0;
+    loop {
+        // Less than all slices need in any stage, and enough for the largest one.
+        let stats = slowly.step(0.0, &all, 70_000);
+        steps += 1;
+        if stats.converging == 0 {
+            break;
+        }
+        assert!(steps < 100, "{} slices never converge", stats.converging);
+    }
+    assert!(steps > 3, "the budget held nothing back");
+    assert_same(&slowly, &at_once);
+}
+
+#[test]
+fn what_is_not_traced_again_could_not_have_changed() {
+    for (scene, options) in [
+        (small_scene(), options(256.0, 64)),
+        (Scene::atrium(), options(48.0, 64)),
+    ] {
+        let mut stepped = world(scene.clone(), options.clone());
+        converge(&mut stepped);
+        let (mut rays, mut rays_if_all) = (0, 0);
+        for time in [0.03, 0.1, 0.2, 0.9, 1.0, 1.1] {
+            let stats = stepped.step(time, &all, u64::MAX);
+            rays += stats.rays;
+            rays_if_all += stats.rays_if_all;
+            assert_sound(&stepped);
+        }
+        assert!(
+            rays * 2 < rays_if_all,
+            "{}: {rays} of {rays_if_all}",
+            scene.name
+        );
+        let mut fresh = world(scene, options);
+        // The same grids, where something has left its own on the way.
+        fresh.step(0.9, &all, 0);
+        fresh.step(1.0, &all, 0);
+        fresh.step(1.1, &all, 0);
+        converge(&mut fresh);
+        assert_same(&stepped, &fresh);
+    }
+}
+
+#[test]
+fn what_moved_out_of_view_is_up_to_date_when_it_is_seen_again() {
+    let (scene, options) = (small_scene(), options(256.0, 64));
+    let mut stepped = world(scene.clone(), options.clone());
+    converge(&mut stepped);
+    let left = |[min, max]: [Vec3; 2]| (min + max).x < 0.0;
+    let mut skipped = 0;
+    for step in 1..=20 {
+        let before = stepped.truth.clone();
+        stepped.step(f64::from(step) * 0.05, &left, u64::MAX);
+        skipped += u32::from(before == stepped.truth);
+    }
+    assert!(skipped < 20, "nothing was seen");
+    stepped.step(1.0, &all, u64::MAX);
+    assert_same(&stepped, &fresh(&scene, &options, 1.0));
+}
+
+#[test]
+fn an_instance_that_a_client_moves_takes_its_shadow_along() {
+    let options = options(256.0, 64);
+    let to = DAffine3::from_translation(DVec3::new(50.7, 0.2, 0.4));
+    let mut moved = world(still_scene(), options.clone());
+    converge(&mut moved);
+    moved.drive(STILL, to).unwrap();
+    moved.step(0.0, &all, u64::MAX);
+    converge(&mut moved);
+    let mut scene = still_scene();
+    let at = psao_server::scene::LocalTransform::Matrix(to);
+    scene.nodes[scene.instances[STILL as usize].node as usize].local = at;
+    let mut there = world(scene, options);
+    converge(&mut there);
+    assert_same(&moved, &there);
+    // A second move is one of something that moves already.
+    let back = DAffine3::from_translation(DVec3::new(50.0, 0.2, 0.0));
+    moved.drive(STILL, back).unwrap();
+    moved.step(0.1, &all, u64::MAX);
+    let mut never = world(still_scene(), moved.options.clone());
+    converge(&mut never);
+    assert_same(&moved, &never);
+}
+
+#[test]
+fn an_instance_or_joints_that_are_not_there_cannot_be_driven() {
+    let mut world = world(small_scene(), options(16.0, 16));
+    let said = world.drive(99, DAffine3::IDENTITY).unwrap_err().to_string();
+    assert!(said.contains("99"), "{said}");
+    for (instance, joints) in [(POST, 1), (POST, 3), (MOVER, 2), (99, 2)] {
+        let joints = vec![glam::Affine3A::IDENTITY; joints];
+        assert!(world.drive_joints(instance, joints).is_err());
+    }
+    assert!(
+        world
+            .drive_joints(POST, vec![glam::Affine3A::IDENTITY; 2])
+            .is_ok()
+    );
+}
+
+#[test]
+fn a_transform_that_makes_no_sense_harms_nothing_else() {
+    let mut world = world(small_scene(), options(64.0, 32));
+    converge(&mut world);
+    let huge = DAffine3::from_translation(DVec3::splat(1e300));
+    let flat = DAffine3::from_scale(DVec3::new(1.0, 0.0, 1.0));
+    let nothing = DAffine3::from_scale(DVec3::ZERO);
+    let large = DAffine3::from_scale(DVec3::splat(1e30));
+    for transform in [huge, flat, nothing, large] {
+        for instance in [STILL, MOVER, SHEET, POST] {
+            world.drive(instance, transform).unwrap();
+        }
+        let joints = vec![glam::Affine3A::from_scale(Vec3::splat(1e30)); 2];
+        world.drive_joints(POST, joints).unwrap();
+        world.step(0.5, &all, u64::MAX);
+        assert_sound(&world);
+    }
+    let away = DAffine3::from_translation(DVec3::new(50.0, 100.0, 0.0));
+    for instance in [STILL, MOVER, SHEET, POST] {
+        world.drive(instance, away).unwrap();
+    }
+    world.step(0.6, &all, u64::MAX);
+    converge(&mut world);
+    let open = points(&world, small_scene::FLOOR);
+    let mut open = open.values().flatten().map(|point| point & 0xff);
+    assert!(
+        open.all(|occlusion| occlusion == 255),
+        "nothing is near the floor"
+    );
+}
+
+#[test]
+fn what_bends_out_of_its_grid_gets_another_and_is_found_there() {
+    let mut world = world(small_scene(), options(512.0, 32));
+    converge(&mut world);
+    let grids = [SHEET, POST].map(|i| world.truth.instances[i as usize]);
+    for step in 0..60 {
+        world.step(f64::from(step) * 0.05, &all, u64::MAX);
+        assert_sound(&world);
+        let lookup = psao_core::Lookup {
+            instances: &world.truth.instances,
+            buckets: &world.truth.buckets,
+            cells: &world.truth.cells,
+        };
+        for instance in [SHEET, POST] {
+            let (positions, normals) = world.vertices(instance);
+            let mesh = &world.scene.meshes[world.scene.instances[instance as usize].mesh as usize];
+            let (mut found, mut asked) = (0, 0);
+            for corners in &mesh.triangles {
+                let middle =
+                    |v: &[Vec3]| corners.iter().map(|&i| v[i as usize]).sum::<Vec3>() / 3.0;
+                let (position, normal) = (middle(positions), middle(normals));
+                let answer = lookup.blend(
+                    Kernel::Planar,
+                    instance,
+                    position.to_array(),
+                    normal.to_array(),
+                );
+                asked += 1;
+                found += u32::from(answer.weight > 0.0);
+            }
+            assert!(
+                found * 20 >= asked * 19,
+                "step {step}: {found} of {asked} on {instance}"
+            );
+        }
+    }
+    assert_ne!(
+        grids[0], world.truth.instances[SHEET as usize],
+        "it was meant to leave its grid"
+    );
+}
+
+#[test]
+fn discarded_points_are_counted() {
+    // Cells of the paper's size are too large for seven points each.
+    let paper = Options {
+        density: 512.0,
+        ..Options::of(Kernel::Paper)
+    };
+    let mut full = world(small_scene(), paper);
+    assert!(full.discarded() > 0);
+    assert_sound(&full);
+    for step in 0..10 {
+        full.step(f64::from(step) * 0.1, &all, 0);
+        assert_sound(&full);
+    }
+    let roomy = world(small_scene(), options(512.0, 16));
+    assert!(roomy.discarded() * 100 < roomy.point_count());
+    assert_sound(&roomy);
+}
+
+#[test]
+fn a_density_that_asks_for_too_much_is_refused_before_memory_is_taken() {
+    let refused = |scene: Scene, density: f64| {
+        let made = World::new(scene, options(density, 16), &|_, _, _| ());
+        made.err().expect("it is refused")
+    };
+    for density in [0.0, -1.0, f64::NAN, f64::INFINITY] {
+        let error = refused(still_scene(), density);
+        assert!(
+            matches!(error, WorldError::Points(PointError::Density(_))),
+            "{error}"
+        );
+        assert!(error.to_string().contains("--density"), "{error}");
+    }
+    // 9 m² of floor: more than one mesh may have, and then more than a scene may.
+    let error = refused(still_scene(), 3e6);
+    assert!(
+        matches!(error, WorldError::Points(PointError::TooMany { .. })),
+        "{error}"
+    );
+    assert!(error.to_string().contains("lower --density"), "{error}");
+    let error = refused(still_scene(), 3e7);
+    assert!(
+        matches!(error, WorldError::TooManyPoints(count) if count > 270_000_000),
+        "{error}"
+    );
+    assert!(error.to_string().contains("lower --density"), "{error}");
+    // Each mesh alone would be within its limit.
+    let mut many = still_scene();
+    let floor = many.instances[0].clone();
+    many.instances.resize(9, floor);
+    let error = refused(many, 1.5e6);
+    assert!(matches!(error, WorldError::TooManyPoints(_)), "{error}");
+}
