@@ -5,12 +5,19 @@ mod small_scene;
 
 use glam::{DAffine3, DVec3, Vec3};
 use psao_core::{Bucket, Cell, Kernel};
-use psao_server::encode::{Compression, Encoder};
+use psao_server::encode::{Compression, Encoder, Scheme};
 use psao_server::points::PointError;
 use psao_server::scene::Scene;
 use psao_server::world::{Options, World, WorldError};
 use small_scene::{MOVER, POST, SHEET, STILL, small_scene, still_scene};
 use std::collections::BTreeMap;
+
+fn cells(threshold: u8) -> Scheme {
+    Scheme::Cells {
+        threshold,
+        compression: Compression::Fast,
+    }
+}
 
 fn options(density: f64, rays: usize) -> Options {
     Options {
@@ -29,7 +36,7 @@ fn all(_: [Vec3; 2]) -> bool {
 }
 
 fn converge(world: &mut World) {
-    world.converge(&all, &|_, _, _| ());
+    world.converge(&all, usize::MAX, &|_, _| ());
 }
 
 /// A world that has seen no other pose than this one.
@@ -165,7 +172,7 @@ fn points_truth_and_stream_are_the_same_on_any_number_of_threads() {
         pool.build().unwrap().install(|| {
             let mut world = world(scene, options(64.0, 64));
             converge(&mut world);
-            let mut encoder = Encoder::new(&world.truth, 2, Compression::Fast);
+            let mut encoder = Encoder::new(&world, cells(2));
             let mut bytes = encoder.header(&world, world.scene.hash(), 30.0);
             for frame in 0..4 {
                 world.step(f64::from(frame) * 0.1, &all, u64::MAX);
@@ -190,7 +197,7 @@ fn points_truth_and_stream_are_the_same_on_any_number_of_threads() {
 #[test]
 fn a_still_scene_costs_no_ray_and_no_byte_once_it_has_converged() {
     let mut world = world(still_scene(), options(256.0, 64));
-    let mut encoder = Encoder::new(&world.truth, 0, Compression::Fast);
+    let mut encoder = Encoder::new(&world, cells(0));
     let (mut rays, mut bytes) = (Vec::new(), Vec::new());
     for frame in 0..6 {
         let step = world.step(f64::from(frame), &all, u64::MAX);
