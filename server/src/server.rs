@@ -214,6 +214,17 @@ impl Server {
         self.viewers.len()
     }
 
+    /// All clients, in the order in which they came.
+    pub fn ids(&self) -> impl Iterator<Item = ClientId> + '_ {
+        self.viewers.keys().copied()
+    }
+
+    /// Whether a client's extended view shows any of a box (of the world, relative to the scene's
+    /// origin); all of it until the client has said where it looks. `None`: no such client.
+    pub fn sees(&self, id: ClientId, bounds: [Vec3; 2]) -> Option<bool> {
+        self.viewers.get(&id).map(|viewer| viewer.sees(bounds))
+    }
+
     /// Content hash of the scene, which clients must share.
     pub fn scene_hash(&self) -> u64 {
         self.scene_hash
