@@ -451,7 +451,7 @@ fn what_a_client_moves_takes_its_shadow_along_for_all_clients() {
     let mut served = Served::start(still_scene(), density);
     let (mut mover, mut other) = (served.join(), served.join());
     let mut here = world(still_scene(), density);
-    here.converge(&|_| true, &|_, _, _| ());
+    here.converge(&|_| true, usize::MAX, &|_, _| ());
     settle(&mut served, &mut mover, |_| true);
     assert!(floor_difference(&mover, &here) <= THRESHOLD);
 
@@ -480,7 +480,7 @@ fn what_a_client_moves_takes_its_shadow_along_for_all_clients() {
     let mut there = world(still_scene(), density);
     there.drive(STILL, DAffine3::from_translation(to)).unwrap();
     there.step(0.0, &|_| true, 0);
-    there.converge(&|_| true, &|_, _, _| ());
+    there.converge(&|_| true, usize::MAX, &|_, _| ());
     assert!(floor_difference(&mover, &here) > 100, "the shadow stays");
     assert!(floor_difference(&mover, &there) <= THRESHOLD);
     served.frame_with(0.0, &mut [&mut other]);
@@ -494,7 +494,7 @@ fn the_joints_that_a_client_sends_bend_the_instance() {
     let mut link = served.join();
     settle(&mut served, &mut link, |_| true);
     let mut here = world(small_scene(), density);
-    here.converge(&|_| true, &|_, _, _| ());
+    here.converge(&|_| true, usize::MAX, &|_, _| ());
     assert!(floor_difference(&link, &here) <= THRESHOLD);
 
     // It lies down on the floor.
@@ -513,7 +513,7 @@ fn the_joints_that_a_client_sends_bend_the_instance() {
     let mut there = world(small_scene(), density);
     there.drive_joints(POST, vec![down; 2]).unwrap();
     there.step(0.0, &|_| true, 0);
-    there.converge(&|_| true, &|_, _, _| ());
+    there.converge(&|_| true, usize::MAX, &|_, _| ());
     assert!(floor_difference(&link, &here) > 100, "the shadow stays");
     assert!(floor_difference(&link, &there) <= THRESHOLD);
     assert!(link.rmse(&served) <= f64::from(THRESHOLD));
