@@ -12,7 +12,7 @@ use psao::core::uplink::{Camera, Transform};
 use psao::core::{Cell, Kernel};
 use psao::quic::{Closed, Connect, Connection, Fingerprint, Trust};
 use psao::{Client, ClientError, Config, State};
-use psao_server::encode::{Compression, capacity_of};
+use psao_server::encode::{Compression, Scheme, capacity_of};
 use psao_server::identity::Identity;
 use psao_server::scene::Scene;
 use psao_server::server::{FrameReport, Server, Settings};
