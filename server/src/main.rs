@@ -4,6 +4,7 @@ use clap::{Parser, Subcommand};
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
 use psao_server::commands::{self, InspectArgs, PlayArgs, RecordArgs, ServeArgs};
 use psao_server::demo::{self, DemoArgs};
+use psao_server::eval::{self, EvalArgs};
 use std::collections::HashMap;
 use std::process::ExitCode;
 use std::sync::Mutex;
@@ -28,6 +29,8 @@ enum Command {
     Play(PlayArgs),
     /// Lists what is in a recording
     Inspect(InspectArgs),
+    /// Measures bits, error and time of the profiles on the same frames
+    Eval(Box<EvalArgs>),
 }
 
 fn main() -> ExitCode {
@@ -52,6 +55,10 @@ fn main() -> ExitCode {
         }),
         Command::Play(args) => commands::play(args).map(|table| print_table(&table)),
         Command::Inspect(args) => commands::inspect(args, &mut std::io::stdout().lock()),
+        Command::Eval(args) => eval::run(args, &progress).map(|found| {
+            bars.finish();
+            print!("{}", found.table());
+        }),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,
