@@ -21,6 +21,7 @@ use psao::{Client, Config};
 use psao_core::Cell;
 use psao_core::mirror::Buffer;
 use psao_core::residual::Quantiser;
+use psao_core::stream::{MAX_BODY_BYTES, PREAMBLE, Packet, StreamError, kind};
 use rayon::{ThreadPool, ThreadPoolBuilder};
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -67,10 +68,15 @@ pub struct EvalArgs {
     /// Points per square metre and side; without it, that of --density
     #[arg(long, value_name = "N,...", value_delimiter = ',')]
     pub densities: Vec<f64>,
-    /// Quantiser steps of profile residual, 1/255; the dead zone is 0.65 steps, rounded
-    #[arg(long, value_name = "N,...", value_delimiter = ',', default_value = "2,3,4,6,8",
-          value_parser = clap::value_parser!(u8).range(1..))]
-    pub steps: Vec<u8>,
+    /// Quantisers of profile residual, 1/255: the step, and the dead zone if it is not 0.65 steps
+    #[arg(
+        long,
+        value_name = "STEP[/DEADZONE],...",
+        value_delimiter = ',',
+        default_value = "1/0,1,2,3,4,6,8",
+        value_parser = parse_quantiser
+    )]
+    pub steps: Vec<Quantiser>,
     /// Frames at each rate. The first second is reported apart; of less than two seconds, the
     /// first half where that is shorter
     #[arg(long, value_name = "N", default_value_t = 60,
@@ -95,6 +101,21 @@ pub struct EvalArgs {
     pub out: Option<PathBuf>,
 }
 
+fn parse_quantiser(text: &str) -> Result<Quantiser, String> {
+    let parse = || {
+        let (step, dead_zone) = match text.split_once('/') {
+            Some((step, dead_zone)) => (step.parse().ok()?, Some(dead_zone.parse().ok()?)),
+            None => (text.parse().ok()?, None),
+        };
+        let usual = (0.65 * f32::from(step)).round() as u8;
+        (step > 0).then_some(Quantiser {
+            step,
+            dead_zone: dead_zone.unwrap_or(usual),
+        })
+    };
+    parse().ok_or_else(|| format!("{text} is not a step of 1 to 255, such as 3, or 3/2"))
+}
+
 /// One profile at one density, rate and quantiser; the names are those of the JSON file.
 ///
 /// Unless it says otherwise, a figure is of the steady frames: those after the first second.
@@ -112,7 +133,10 @@ pub struct Row {
     pub quant: String,
     /// Megabits per second of scene time.
     pub mbit_per_s: f64,
-    /// The same over the frames before the steady ones, with the stream's header.
+    /// The part of it that is occlusion alone, in slices packets (profile `residual`); the rest is
+    /// cells that come into view, and what packets cost in themselves.
+    pub mbit_per_s_slices: f64,
+    /// All of it, over the frames before the steady ones, with the stream's header.
     pub mbit_per_s_first_second: f64,
     /// Root mean square difference of the client's visible points from the server's, 1/255.
     pub rmse_255: f64,
@@ -269,14 +293,7 @@ impl Bench<'_> {
         let mut world = scene.world(profile == ProfileArg::Residual, &placing)?;
         let schemes: Vec<Scheme> = match profile {
             ProfileArg::Cells => vec![CELLS],
-            ProfileArg::Residual => args
-                .steps
-                .iter()
-                .map(|&step| {
-                    let dead_zone = (0.65 * f32::from(step)).round() as u8;
-                    Scheme::Residual(Quantiser { step, dead_zone })
-                })
-                .collect(),
+            ProfileArg::Residual => args.steps.iter().copied().map(Scheme::Residual).collect(),
         };
         bounded(&world, schemes.len())?;
         let aspect = args.size.0 as f32 / args.size.1 as f32;
@@ -406,6 +423,7 @@ struct Stream {
 
 struct StreamFrame {
     bytes: usize,
+    slices_bytes: usize,
     encode_ms: f64,
     decode_ms: f64,
     rmse_255: f64,
@@ -481,6 +499,7 @@ impl Stream {
         }
         self.frames.push(StreamFrame {
             bytes: self.bytes.len(),
+            slices_bytes: slices_bytes(&self.bytes).map_err(|error| error.to_string())?,
             encode_ms,
             decode_ms,
             rmse_255: point_rmse(world, mine, visible),
@@ -530,6 +549,7 @@ impl Stream {
             },
             quant: name_of(self.scheme),
             mbit_per_s: mean(&kbits[steady..]) * rate_hz / 1e3,
+            mbit_per_s_slices: mean(&of(&|frame| frame.slices_bytes as f64)) * 8e-6 * rate_hz,
             mbit_per_s_first_second: mean(&kbits[..steady]) * rate_hz / 1e3,
             rmse_255: mean(&of(&|frame| frame.rmse_255 * frame.rmse_255)).sqrt(),
             psnr_db: seen.then(|| -10.0 * error.log10()),
@@ -543,6 +563,21 @@ impl Stream {
             ..Row::default()
         }
     }
+}
+
+/// Bytes in slices packets.
+fn slices_bytes(stream: &[u8]) -> Result<usize, StreamError> {
+    let mut rest = stream.strip_prefix(&PREAMBLE).unwrap_or(stream);
+    let mut bytes = 0;
+    while let Some((packet, length)) = Packet::read(rest, MAX_BODY_BYTES)? {
+        bytes += if packet.kind == kind::SLICES {
+            length
+        } else {
+            0
+        };
+        rest = &rest[length..];
+    }
+    Ok(bytes)
 }
 
 /// A quantiser in words.
@@ -637,6 +672,7 @@ impl Evaluation {
             "/m²",
             "Hz",
             "Mbit/s",
+            "slices",
             "first s",
             "rmse/255",
             "dB",
@@ -660,6 +696,7 @@ impl Evaluation {
                 row.density.to_string(),
                 row.rate_hz.to_string(),
                 format!("{:.2}", row.mbit_per_s),
+                format!("{:.2}", row.mbit_per_s_slices),
                 format!("{:.2}", row.mbit_per_s_first_second),
                 format!("{:.3}", row.rmse_255),
                 optional(row.psnr_db, 2),

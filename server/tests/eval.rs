@@ -117,7 +117,7 @@ fn options_out_of_range_are_refused_by_name() {
     let refused = |options: &str| run(&parse(options), &|_, _, _| ()).expect_err("is refused");
     assert!(refused("--rates 0").contains("--rates"));
     assert!(refused("--rates nan").contains("--rates"));
-    assert!(refused("--densities -1").contains("density"));
+    assert!(refused("--densities 0").contains("density"));
     assert!(refused(&format!("--steps {}", ["2"; 17].join(","))).contains("--steps"));
     for options in [
         "--steps 0",
