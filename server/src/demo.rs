@@ -56,7 +56,7 @@ pub struct DemoArgs {
     pub json: Option<PathBuf>,
 }
 
-fn parse_size(text: &str) -> Result<(usize, usize), String> {
+pub(crate) fn parse_size(text: &str) -> Result<(usize, usize), String> {
     let parse = || {
         let (width, height) = text.split_once('x')?;
         let size: (usize, usize) = (width.parse().ok()?, height.parse().ok()?);

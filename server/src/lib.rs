@@ -5,6 +5,7 @@ pub mod camera;
 pub mod commands;
 pub mod demo;
 pub mod encode;
+pub mod eval;
 pub mod identity;
 pub mod metrics;
 pub mod picture;

@@ -4,6 +4,7 @@ use clap::{Parser, Subcommand};
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
 use psao_server::commands::{self, InspectArgs, PlayArgs, RecordArgs, ServeArgs};
 use psao_server::demo::{self, DemoArgs};
+use psao_server::eval::{self, EvalArgs};
 use std::collections::HashMap;
 use std::io::Write;
 use std::process::ExitCode;
@@ -29,6 +30,8 @@ enum Command {
     Play(PlayArgs),
     /// Lists what is in a recording
     Inspect(InspectArgs),
+    /// Measures bits, error and time of the profiles on the same frames
+    Eval(Box<EvalArgs>),
 }
 
 fn main() -> ExitCode {
@@ -57,6 +60,10 @@ fn main() -> ExitCode {
         Command::Inspect(args) => {
             commands::inspect(args, &mut std::io::stdout().lock()).map(|()| String::new())
         }
+        Command::Eval(args) => eval::run(args, &progress).map(|found| {
+            bars.finish();
+            found.table()
+        }),
     };
     let result = result.and_then(|text| {
         let written = std::io::stdout().write_all(text.as_bytes());

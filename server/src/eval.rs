@@ -1,0 +1,907 @@
+//! `psao eval`: what each profile costs and how far off it is, for every density, rate and
+//! quantiser, on the same frames of one scene and without a network.
+//!
+//! All streams of a profile and rate are encoded and decoded side by side over the same steps of
+//! one world, so they differ in nothing but the quantiser. The two profiles need a world each (one
+//! in rest space), which trace the same rays along the same camera path.
+
+use crate::args::{ProfileArg, SceneArgs, camera_path};
+use crate::camera::{CameraPath, Frustum};
+use crate::demo::parse_size;
+use crate::encode::{Compression, Encoder, Scheme, capacity_of, point_rmse};
+use crate::metrics::Pair;
+use crate::picture::write_whole;
+use crate::render::{REFERENCE_RAYS, View};
+use crate::report::{Form, Plot, Report};
+use crate::samples::Samples;
+use crate::world::{Progress, World};
+use clap::Args;
+use glam::Vec3;
+use psao::{Client, Config};
+use psao_core::Cell;
+use psao_core::mirror::Buffer;
+use psao_core::residual::Quantiser;
+use psao_core::stream::{MAX_BODY_BYTES, PREAMBLE, Packet, StreamError, kind};
+use rayon::{ThreadPool, ThreadPoolBuilder};
+use serde::Serialize;
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::time::Instant;
+
+/// Profile `cells` is measured as the paper's: this threshold, and zstd level 15, strategy 4.
+const CELLS: Scheme = Scheme::Cells {
+    threshold: 2,
+    compression: Compression::Paper,
+};
+
+/// As the live server's default.
+const MARGIN_DEGREES: f32 = 10.0;
+
+/// Most memory that the streams measured side by side may take, bytes.
+const MAX_STREAMS_BYTES: u64 = 16 << 30;
+
+/// Most values a list option takes: each multiplies the work.
+const MAX_VALUES: usize = 16;
+
+/// Options of `psao eval`.
+#[derive(Args, Clone, Debug)]
+pub struct EvalArgs {
+    /// The scene.
+    #[command(flatten)]
+    pub scene: SceneArgs,
+    /// Stream profiles to compare
+    #[arg(
+        long,
+        value_enum,
+        value_delimiter = ',',
+        default_value = "cells,residual"
+    )]
+    pub profiles: Vec<ProfileArg>,
+    /// Server frames per second
+    #[arg(
+        long,
+        value_name = "HZ,...",
+        value_delimiter = ',',
+        default_value = "15,60"
+    )]
+    pub rates: Vec<f64>,
+    /// Points per square metre and side; without it, that of --density
+    #[arg(long, value_name = "N,...", value_delimiter = ',')]
+    pub densities: Vec<f64>,
+    /// Quantisers of profile residual, 1/255: the step, and the dead zone if it is not 0.65 steps
+    #[arg(
+        long,
+        value_name = "STEP[/DEADZONE],...",
+        value_delimiter = ',',
+        default_value = "1/0,1,2,3,4,6,8",
+        value_parser = parse_quantiser
+    )]
+    pub steps: Vec<Quantiser>,
+    /// Frames at each rate. The first second is reported apart; of less than two seconds, the
+    /// first half where that is shorter
+    #[arg(long, value_name = "N", default_value_t = 60,
+          value_parser = clap::value_parser!(u32).range(2..=100_000))]
+    pub frames: u32,
+    /// Which of the two camera paths to walk
+    #[arg(long, value_name = "N", default_value_t = 1,
+          value_parser = clap::value_parser!(u32).range(0..=1))]
+    pub path: u32,
+    /// Frames at each rate that are compared with a ray-traced picture
+    #[arg(long, value_name = "N", default_value_t = 2,
+          value_parser = clap::value_parser!(u32).range(1..=64))]
+    pub pictures: u32,
+    /// Size of those pictures
+    #[arg(long, value_name = "WxH", default_value = "320x180", value_parser = parse_size)]
+    pub size: (usize, usize),
+    /// Writes the figures as JSON
+    #[arg(long, value_name = "FILE")]
+    pub json: Option<PathBuf>,
+    /// Folder for report.html, with the plots
+    #[arg(long, value_name = "DIR")]
+    pub out: Option<PathBuf>,
+}
+
+fn parse_quantiser(text: &str) -> Result<Quantiser, String> {
+    let parse = || {
+        let (step, dead_zone) = match text.split_once('/') {
+            Some((step, dead_zone)) => (step.parse().ok()?, Some(dead_zone.parse().ok()?)),
+            None => (text.parse().ok()?, None),
+        };
+        let usual = (0.65 * f32::from(step)).round() as u8;
+        (step > 0).then_some(Quantiser {
+            step,
+            dead_zone: dead_zone.unwrap_or(usual),
+        })
+    };
+    parse().ok_or_else(|| format!("{text} is not a step of 1 to 255, such as 3, or 3/2"))
+}
+
+/// One profile at one density, rate and quantiser; the names are those of the JSON file.
+///
+/// Unless it says otherwise, a figure is of the steady frames: those after the first second.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct Row {
+    /// Scene file or `atrium`.
+    pub scene: String,
+    /// Stream profile.
+    pub profile: &'static str,
+    /// Points per square metre and side.
+    pub density: f64,
+    /// Frames per second of scene time.
+    pub rate_hz: f64,
+    /// What is not sent, and how coarse what is, in 1/255.
+    pub quant: String,
+    /// Megabits per second of scene time.
+    pub mbit_per_s: f64,
+    /// The part of it that is occlusion alone, in slices packets (profile `residual`); the rest is
+    /// cells that come into view, and what packets cost in themselves.
+    pub mbit_per_s_slices: f64,
+    /// All of it, over the frames before the steady ones, with the stream's header.
+    pub mbit_per_s_first_second: f64,
+    /// Root mean square difference of the client's visible points from the server's, 1/255.
+    pub rmse_255: f64,
+    /// AO alone against the reference, over the pixels of all pictures; `null` if none shows the
+    /// scene.
+    pub psnr_db: Option<f64>,
+    /// Mean FLIP of the pictures; `null` if none shows the scene.
+    pub flip: Option<f64>,
+    /// Median milliseconds that the client takes for a frame's bytes, on one thread.
+    pub decode_ms: f64,
+    /// 99th percentile of the same.
+    pub decode_p99_ms: f64,
+    /// Median milliseconds of selecting and encoding a frame, on one thread.
+    pub encode_ms: f64,
+    /// Median milliseconds of the world's step, on all threads; shared by all clients.
+    pub step_ms: f64,
+    /// Rays traced a frame.
+    pub rays_per_frame: f64,
+    /// Points of the client's buffers that a frame changed.
+    pub points_changed_per_frame: f64,
+    /// Share of the cells that are skipped for being open: 0 until any is.
+    pub cells_skipped_share: f64,
+    /// Memory of the client: buffers and all.
+    pub client_bytes: u64,
+    /// The first frame: all that is in view.
+    pub first_frame_bytes: u64,
+}
+
+/// Profile `cells` against profile `residual` at the point error of `cells`.
+#[derive(Clone, Debug, Serialize)]
+pub struct Comparison {
+    /// Points per square metre and side.
+    pub density: f64,
+    /// Frames per second of scene time.
+    pub rate_hz: f64,
+    /// Point error of `cells`, 1/255.
+    pub rmse_255: f64,
+    /// Bits of `cells` over bits of `residual`, interpolated to that error; `null` where there is
+    /// nothing to interpolate between (one quantiser, or no bits).
+    pub bits_cells_over_residual: Option<f64>,
+    /// That error is outside of what the quantisers span.
+    pub extrapolated: bool,
+    /// The quantiser nearest to that error, which the times are of.
+    pub nearest_quant: String,
+    /// Its error, 1/255.
+    pub nearest_rmse_255: f64,
+    /// Decode time of `residual` over that of `cells`.
+    pub decode_residual_over_cells: f64,
+    /// Encode time of `cells` over that of `residual`.
+    pub encode_cells_over_residual: f64,
+}
+
+/// What an evaluation found; the names are those of the JSON file.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct Evaluation {
+    /// Frames at each rate.
+    pub frames: u32,
+    /// Camera path.
+    pub path: u32,
+    /// One a profile, density, rate and quantiser.
+    pub rows: Vec<Row>,
+    /// One a density and rate, if both profiles were measured.
+    pub comparisons: Vec<Comparison>,
+    /// Kilobits of each frame, a row.
+    #[serde(skip)]
+    kbits: Vec<Vec<f64>>,
+}
+
+/// Frames that are reported apart from the steady ones.
+fn left_out(frames: u32, rate_hz: f64) -> u32 {
+    (rate_hz.ceil() as u32).min(frames / 2).max(1)
+}
+
+/// Runs the evaluation.
+///
+/// # Errors
+/// What went wrong, and what to do about it.
+pub fn run(args: &EvalArgs, progress: Progress<'_>) -> Result<Evaluation, String> {
+    for (name, count) in [
+        ("--profiles", args.profiles.len()),
+        ("--rates", args.rates.len()),
+        ("--densities", args.densities.len()),
+        ("--steps", args.steps.len()),
+    ] {
+        if count > MAX_VALUES {
+            return Err(format!("{name} takes at most {MAX_VALUES} values"));
+        }
+    }
+    if !args.rates.iter().all(|rate| *rate > 0.0 && *rate <= 1000.0) {
+        return Err("--rates must be above 0 and at most 1000".into());
+    }
+    let pool = ThreadPoolBuilder::new().num_threads(1).build();
+    let mut bench = Bench {
+        args,
+        pool: pool.map_err(|error| format!("no thread to encode on: {error}"))?,
+        samples: Samples::new(REFERENCE_RAYS),
+        references: BTreeMap::new(),
+    };
+    let mut found = Evaluation {
+        frames: args.frames,
+        path: args.path,
+        ..Evaluation::default()
+    };
+    let one = [args.scene.density];
+    let densities = if args.densities.is_empty() {
+        &one
+    } else {
+        &args.densities[..]
+    };
+    for &density in densities {
+        for &profile in &args.profiles {
+            bench.profile(profile, density, &mut found, progress)?;
+        }
+        for &rate_hz in &args.rates {
+            found.compare(density, rate_hz);
+        }
+    }
+    if let Some(path) = &args.json {
+        let json = serde_json::to_string_pretty(&found).map_err(|error| error.to_string())?;
+        write_whole(path, json.as_bytes()).map_err(|error| error.to_string())?;
+    }
+    if let Some(folder) = &args.out {
+        let page = folder.join("report.html");
+        found.report().write(&page).map_err(|e| e.to_string())?;
+    }
+    Ok(found)
+}
+
+/// What all rows share.
+struct Bench<'a> {
+    args: &'a EvalArgs,
+    /// One thread, to encode on.
+    pool: ThreadPool,
+    samples: Samples,
+    /// Ray-traced pictures by rate and frame: the same for every profile and density.
+    references: BTreeMap<(u64, u32), Vec<f32>>,
+}
+
+impl Bench<'_> {
+    fn profile(
+        &mut self,
+        profile: ProfileArg,
+        density: f64,
+        found: &mut Evaluation,
+        progress: Progress<'_>,
+    ) -> Result<(), String> {
+        let args = self.args;
+        let stage = |name: &str| format!("{} {density}/m² {name}", profile.name());
+        let scene = SceneArgs {
+            density,
+            ..args.scene.clone()
+        };
+        let placing = |name: &str, done, total| progress(&stage(name), done, total);
+        let mut world = scene.world(profile == ProfileArg::Residual, &placing)?;
+        let schemes: Vec<Scheme> = match profile {
+            ProfileArg::Cells => vec![CELLS],
+            ProfileArg::Residual => args.steps.iter().copied().map(Scheme::Residual).collect(),
+        };
+        bounded(&world, schemes.len())?;
+        let aspect = args.size.0 as f32 / args.size.1 as f32;
+        let path = camera_path(&world, args.path, aspect)?;
+
+        // All rays come first: the frames are to show what the stream can do, not how points
+        // converge.
+        let views: Vec<Frustum> = args
+            .rates
+            .iter()
+            .flat_map(|&rate| (0..args.frames).map(move |frame| f64::from(frame) / rate))
+            .map(|time| view(&path, time))
+            .collect();
+        let seen = |[min, max]: [Vec3; 2]| views.iter().any(|view| view.sees_box(min, max));
+        let converging = |done, total| progress(&stage("convergence"), done, total);
+        world.converge(&seen, world.options.rays, &converging);
+
+        for &rate_hz in &args.rates {
+            // Back to the start, with all that will be seen as it is then.
+            world.step(0.0, &seen, u64::MAX);
+            world.truth.clear_changes();
+            let name = format!("{rate_hz} Hz");
+            let frames = |done, total| progress(&stage(&name), done, total);
+            self.rate(&mut world, &path, rate_hz, &schemes, found, &frames)?;
+        }
+        Ok(())
+    }
+
+    /// Streams of all schemes, side by side.
+    fn rate(
+        &mut self,
+        world: &mut World,
+        path: &CameraPath,
+        rate_hz: f64,
+        schemes: &[Scheme],
+        found: &mut Evaluation,
+        report: &dyn Fn(u64, u64),
+    ) -> Result<(), String> {
+        let args = self.args;
+        let mut streams: Vec<Stream> = schemes
+            .iter()
+            .map(|&scheme| Stream::new(world, scheme, rate_hz))
+            .collect();
+        let (mut step_ms, mut rays) = (Vec::new(), Vec::new());
+        for frame in 0..args.frames {
+            let time = f64::from(frame) / rate_hz;
+            let view = view(path, time);
+            let visible = |[min, max]: [Vec3; 2]| view.sees_box(min, max);
+            let start = Instant::now();
+            let step = world.step(time, &visible, u64::MAX);
+            step_ms.push(ms(start));
+            rays.push(step.rays as f64);
+            for stream in &mut streams {
+                stream.frame(world, (time * 1e9) as u64, &visible, &self.pool)?;
+            }
+            world.truth.clear_changes();
+            // The middle of each of as many equal parts of the steady frames.
+            let first = left_out(args.frames, rate_hz);
+            let steady = args.frames - first;
+            let pictures = args.pictures.min(steady);
+            let middle = |i| first + (2 * i + 1) * steady / (2 * pictures);
+            if (0..pictures).any(|i| middle(i) == frame) {
+                let camera = path.at(time);
+                let view = View::new(world, &camera, args.size.0, args.size.1);
+                let key = (rate_hz.to_bits(), frame);
+                let trace = || view.trace(world, &self.samples);
+                let reference = self.references.entry(key).or_insert_with(trace);
+                streams.iter_mut().for_each(|s| s.look(&view, reference));
+            }
+            report(u64::from(frame) + 1, u64::from(args.frames));
+        }
+        let steady = left_out(args.frames, rate_hz) as usize;
+        for stream in streams {
+            found.kbits.push(stream.kbits());
+            found.rows.push(Row {
+                scene: world.scene.name.clone(),
+                density: world.options.density,
+                rate_hz,
+                step_ms: percentile(&step_ms[steady..], 0.5),
+                rays_per_frame: mean(&rays[steady..]),
+                ..stream.row(steady, rate_hz)
+            });
+        }
+        Ok(())
+    }
+}
+
+fn view(path: &CameraPath, time_s: f64) -> Frustum {
+    Frustum::new(&path.at(time_s), MARGIN_DEGREES.to_radians())
+}
+
+/// Checks that streams side by side have room.
+fn bounded(world: &World, streams: usize) -> Result<(), String> {
+    let capacity = capacity_of(&world.truth);
+    // Mirrors at both ends and what the client had before; at both ends, what the residual codec
+    // keeps (at most 32 bytes a point).
+    let elements = u64::from(capacity.cells) + u64::from(capacity.buckets);
+    let each = elements * 3 * 32 + world.point_count() as u64 * 2 * 32;
+    let total = each * streams as u64;
+    if total > MAX_STREAMS_BYTES {
+        return Err(format!(
+            "{streams} streams side by side would take {} GiB, more than {}: lower --density or \
+             give fewer --steps",
+            total >> 30,
+            MAX_STREAMS_BYTES >> 30
+        ));
+    }
+    Ok(())
+}
+
+/// One encoder and the client that follows it.
+struct Stream {
+    scheme: Scheme,
+    encoder: Encoder,
+    client: Client,
+    /// The client's cells before the frame.
+    before: Vec<Cell>,
+    /// Bytes made and not pushed yet: before the first frame, the header.
+    bytes: Vec<u8>,
+    frames: Vec<StreamFrame>,
+    /// Of all pictures: squared error, pixels, FLIP, pictures.
+    squares: f64,
+    pixels: f64,
+    flip: f64,
+    pictures: f64,
+}
+
+struct StreamFrame {
+    bytes: usize,
+    slices_bytes: usize,
+    encode_ms: f64,
+    decode_ms: f64,
+    rmse_255: f64,
+    points: u64,
+}
+
+impl Stream {
+    fn new(world: &World, scheme: Scheme, rate_hz: f64) -> Stream {
+        let scene_hash = world.scene.hash();
+        let mut encoder = Encoder::new(world, scheme);
+        let bytes = encoder.header(world, scene_hash, rate_hz as f32);
+        Stream {
+            scheme,
+            encoder,
+            client: Client::new(Config {
+                capacity: capacity_of(&world.truth),
+                scene_hash,
+            }),
+            before: vec![Cell::default(); world.truth.cells.len()],
+            bytes,
+            frames: Vec::new(),
+            squares: 0.0,
+            pixels: 0.0,
+            flip: 0.0,
+            pictures: 0.0,
+        }
+    }
+
+    fn frame(
+        &mut self,
+        world: &World,
+        time_ns: u64,
+        visible: &(dyn Fn([Vec3; 2]) -> bool + Sync),
+        pool: &ThreadPool,
+    ) -> Result<(), String> {
+        let (encoder, bytes) = (&mut self.encoder, &mut self.bytes);
+        let encode_ms = pool.install(|| {
+            let start = Instant::now();
+            encoder.merge(&world.truth);
+            encoder.frame(world, time_ns, visible, true, bytes);
+            ms(start)
+        });
+        let start = Instant::now();
+        let (mut rest, mut shown) = (&self.bytes[..], None);
+        while !rest.is_empty() {
+            let pushed = self.client.push(rest).map_err(|error| error.to_string())?;
+            rest = &rest[pushed.consumed..];
+            shown = pushed.frame.or(shown);
+        }
+        let decode_ms = ms(start);
+        let (mine, theirs) = (self.client.mirror(), self.encoder.mirror());
+        let shown = shown.is_some_and(|frame| frame.id == self.encoder.frame_id());
+        if !shown || mine.hash() != theirs.hash() {
+            let frame = self.encoder.frame_id();
+            return Err(format!(
+                "{}: the client's mirror is not the server's after frame {frame}; please report it",
+                name_of(self.scheme)
+            ));
+        }
+        let mut points = 0;
+        for run in mine.dirty_runs(Buffer::Cells) {
+            let run = run.start as usize..run.end as usize;
+            let pairs = self.before[run.clone()].iter_mut().zip(&mine.cells()[run]);
+            for (before, now) in pairs {
+                let changed = before
+                    .points
+                    .iter()
+                    .zip(&now.points)
+                    .filter(|(a, b)| a != b);
+                points += changed.count() as u64;
+                *before = *now;
+            }
+        }
+        self.frames.push(StreamFrame {
+            bytes: self.bytes.len(),
+            slices_bytes: slices_bytes(&self.bytes).map_err(|error| error.to_string())?,
+            encode_ms,
+            decode_ms,
+            rmse_255: point_rmse(world, mine, visible),
+            points,
+        });
+        self.client.clear_dirty();
+        self.bytes.clear();
+        Ok(())
+    }
+
+    /// Compares what the client would show with the reference.
+    fn look(&mut self, view: &View, reference: &[f32]) {
+        let Some(header) = self.client.header() else {
+            return;
+        };
+        let valid = view.valid();
+        let blended = view.blend(self.client.mirror().lookup(), header.kernel);
+        let size = (view.width, view.height);
+        // A camera that sees nothing of the scene has nothing to compare.
+        if let Ok(pair) = Pair::new(reference, &blended.openness, &valid, size.0, size.1) {
+            let pixels = valid.iter().filter(|valid| **valid).count() as f64;
+            self.squares += pair.rmse().powi(2) * pixels;
+            self.pixels += pixels;
+            self.flip += pair.flip();
+            self.pictures += 1.0;
+        }
+    }
+
+    fn kbits(&self) -> Vec<f64> {
+        let bytes = self.frames.iter().map(|frame| frame.bytes as f64);
+        bytes.map(|bytes| bytes * 8e-3).collect()
+    }
+
+    /// The figures of the frames from `steady` on.
+    fn row(&self, steady: usize, rate_hz: f64) -> Row {
+        let of = |value: &dyn Fn(&StreamFrame) -> f64| -> Vec<f64> {
+            self.frames[steady..].iter().map(value).collect()
+        };
+        let kbits = self.kbits();
+        let decode = of(&|frame| frame.decode_ms);
+        let seen = self.pictures > 0.0;
+        let error = (self.squares / self.pixels).max(1e-12);
+        Row {
+            profile: match self.scheme {
+                Scheme::Cells { .. } => ProfileArg::Cells.name(),
+                Scheme::Residual(_) => ProfileArg::Residual.name(),
+            },
+            quant: name_of(self.scheme),
+            mbit_per_s: mean(&kbits[steady..]) * rate_hz / 1e3,
+            mbit_per_s_slices: mean(&of(&|frame| frame.slices_bytes as f64)) * 8e-6 * rate_hz,
+            mbit_per_s_first_second: mean(&kbits[..steady]) * rate_hz / 1e3,
+            rmse_255: mean(&of(&|frame| frame.rmse_255 * frame.rmse_255)).sqrt(),
+            psnr_db: seen.then(|| -10.0 * error.log10()),
+            flip: seen.then(|| self.flip / self.pictures),
+            decode_ms: percentile(&decode, 0.5),
+            decode_p99_ms: percentile(&decode, 0.99),
+            encode_ms: percentile(&of(&|frame| frame.encode_ms), 0.5),
+            points_changed_per_frame: mean(&of(&|frame| frame.points as f64)),
+            client_bytes: self.client.memory_bytes(),
+            first_frame_bytes: self.frames[0].bytes as u64,
+            ..Row::default()
+        }
+    }
+}
+
+/// Bytes in slices packets.
+fn slices_bytes(stream: &[u8]) -> Result<usize, StreamError> {
+    let mut rest = stream.strip_prefix(&PREAMBLE).unwrap_or(stream);
+    let mut bytes = 0;
+    while let Some((packet, length)) = Packet::read(rest, MAX_BODY_BYTES)? {
+        bytes += if packet.kind == kind::SLICES {
+            length
+        } else {
+            0
+        };
+        rest = &rest[length..];
+    }
+    Ok(bytes)
+}
+
+/// A quantiser in words.
+fn name_of(scheme: Scheme) -> String {
+    match scheme {
+        Scheme::Cells { threshold, .. } => format!("threshold {threshold}"),
+        Scheme::Residual(Quantiser { step, dead_zone }) => {
+            format!("step {step}, dead zone {dead_zone}")
+        }
+    }
+}
+
+fn ms(since: Instant) -> f64 {
+    since.elapsed().as_secs_f64() * 1e3
+}
+
+fn mean(values: &[f64]) -> f64 {
+    values.iter().sum::<f64>() / values.len().max(1) as f64
+}
+
+/// The value that this share of the values is below.
+fn percentile(values: &[f64], share: f64) -> f64 {
+    let mut sorted = values.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    let index = (sorted.len() as f64 * share) as usize;
+    sorted
+        .get(index.min(sorted.len().saturating_sub(1)))
+        .copied()
+        .unwrap_or(0.0)
+}
+
+/// Mbit/s at a point error, from measured pairs of both: on straight lines through neighbouring
+/// pairs, with bits logarithmic. Also says whether the error is outside of them.
+fn bits_at(rmse: f64, measured: &[(f64, f64)]) -> Option<(f64, bool)> {
+    let mut pairs = measured.to_vec();
+    pairs.sort_by(|a, b| a.0.total_cmp(&b.0));
+    pairs.dedup_by(|a, b| a.0 == b.0);
+    if pairs.len() < 2 || pairs.iter().any(|(_, bits)| *bits <= 0.0) {
+        return None;
+    }
+    let above = pairs.partition_point(|(error, _)| *error < rmse);
+    let [(x0, y0), (x1, y1)] = {
+        let upper = above.clamp(1, pairs.len() - 1);
+        [pairs[upper - 1], pairs[upper]]
+    };
+    let along = (rmse - x0) / (x1 - x0);
+    let bits = (y0.ln() + along * (y1.ln() - y0.ln())).exp();
+    let extrapolated = rmse < pairs[0].0 || rmse > pairs[pairs.len() - 1].0;
+    Some((bits, extrapolated))
+}
+
+impl Evaluation {
+    fn compare(&mut self, density: f64, rate_hz: f64) {
+        let of = |profile: ProfileArg| -> Vec<&Row> {
+            let rows = self.rows.iter().filter(|row| row.profile == profile.name());
+            rows.filter(|row| row.density == density && row.rate_hz == rate_hz)
+                .collect()
+        };
+        let residual = of(ProfileArg::Residual);
+        let off = |row: &Row, from: f64| (row.rmse_255 - from).abs();
+        let Some(cells) = of(ProfileArg::Cells).first().copied() else {
+            return;
+        };
+        let nearest = residual
+            .iter()
+            .min_by(|a, b| off(a, cells.rmse_255).total_cmp(&off(b, cells.rmse_255)));
+        let Some(nearest) = nearest else { return };
+        let measured: Vec<(f64, f64)> = residual
+            .iter()
+            .map(|row| (row.rmse_255, row.mbit_per_s))
+            .collect();
+        let bits = bits_at(cells.rmse_255, &measured);
+        let comparison = Comparison {
+            density,
+            rate_hz,
+            rmse_255: cells.rmse_255,
+            bits_cells_over_residual: bits.map(|(bits, _)| cells.mbit_per_s / bits),
+            extrapolated: bits.is_some_and(|(_, extrapolated)| extrapolated),
+            nearest_quant: nearest.quant.clone(),
+            nearest_rmse_255: nearest.rmse_255,
+            decode_residual_over_cells: nearest.decode_ms / cells.decode_ms,
+            encode_cells_over_residual: cells.encode_ms / nearest.encode_ms,
+        };
+        self.comparisons.push(comparison);
+    }
+
+    /// All rows as a table, and what they come to.
+    pub fn table(&self) -> String {
+        let heads = [
+            "profile",
+            "quantiser",
+            "/m²",
+            "Hz",
+            "Mbit/s",
+            "slices",
+            "first s",
+            "rmse/255",
+            "dB",
+            "FLIP",
+            "decode ms",
+            "p99",
+            "encode ms",
+            "step ms",
+            "krays",
+            "points",
+            "client MB",
+        ];
+        let mut lines = vec![heads.map(String::from)];
+        for row in &self.rows {
+            let optional = |value: Option<f64>, digits| {
+                value.map_or("-".into(), |value| format!("{value:.digits$}"))
+            };
+            lines.push([
+                row.profile.into(),
+                row.quant.clone(),
+                row.density.to_string(),
+                row.rate_hz.to_string(),
+                format!("{:.2}", row.mbit_per_s),
+                format!("{:.2}", row.mbit_per_s_slices),
+                format!("{:.2}", row.mbit_per_s_first_second),
+                format!("{:.3}", row.rmse_255),
+                optional(row.psnr_db, 2),
+                optional(row.flip, 4),
+                format!("{:.3}", row.decode_ms),
+                format!("{:.3}", row.decode_p99_ms),
+                format!("{:.3}", row.encode_ms),
+                format!("{:.1}", row.step_ms),
+                format!("{:.1}", row.rays_per_frame / 1e3),
+                format!("{:.0}", row.points_changed_per_frame),
+                format!("{:.1}", row.client_bytes as f64 / 1e6),
+            ]);
+        }
+        let wide = |column: usize| {
+            let cells = lines.iter().map(|line| line[column].chars().count());
+            cells.max().unwrap_or(0)
+        };
+        let widths: Vec<usize> = (0..heads.len()).map(wide).collect();
+        let rule: Vec<String> = widths.iter().map(|width| "-".repeat(*width)).collect();
+        let join = |line: &[String]| {
+            let cells = line.iter().zip(&widths);
+            let cells: Vec<String> = cells
+                .map(|(cell, width)| format!("{cell:width$}"))
+                .collect();
+            format!("| {} |\n", cells.join(" | "))
+        };
+        let mut out = join(&lines[0]) + &join(&rule);
+        lines[1..].iter().for_each(|line| out += &join(line));
+        out += "\n";
+        for (what, value) in self.conclusions() {
+            out += &format!("{what}: {value}\n");
+        }
+        out
+    }
+
+    fn conclusions(&self) -> Vec<(String, String)> {
+        let mut lines: Vec<(String, String)> = Vec::new();
+        for found in &self.comparisons {
+            let bits = match found.bits_cells_over_residual {
+                Some(ratio) if found.extrapolated => format!("{ratio:.1} (extrapolated)"),
+                Some(ratio) => format!("{ratio:.1}"),
+                None => "unknown (needs two --steps and some bits)".into(),
+            };
+            lines.push((
+                format!("{}/m², {} Hz", found.density, found.rate_hz),
+                format!(
+                    "bits of cells over residual at {:.3}/255 rms {bits}; at {} ({:.3}/255): \
+                     decode time of residual over cells {:.2}, encode time of cells over residual \
+                     {:.1}",
+                    found.rmse_255,
+                    found.nearest_quant,
+                    found.nearest_rmse_255,
+                    found.decode_residual_over_cells,
+                    found.encode_cells_over_residual
+                ),
+            ));
+        }
+        let mut rates: Vec<f64> = self.rows.iter().map(|row| row.rate_hz).collect();
+        rates.dedup();
+        rates.sort_by(f64::total_cmp);
+        rates.dedup();
+        let steady = rates.iter().map(|&rate| {
+            let first = left_out(self.frames, rate);
+            format!("{} of {} at {rate} Hz", self.frames - first, self.frames)
+        });
+        lines.push((
+            "steady frames".into(),
+            format!(
+                "the last {}; those before are \"first s\"",
+                steady.collect::<Vec<_>>().join(", ")
+            ),
+        ));
+        lines.push((
+            "cells skipped".into(),
+            "none: open cells are still sent".into(),
+        ));
+        lines
+    }
+
+    fn report(&self) -> Report {
+        let scene = self.rows.first().map_or("", |row| &row.scene);
+        let mut summary = self.conclusions();
+        for row in &self.rows {
+            summary.push((
+                format!(
+                    "{} {}, {}/m², {} Hz",
+                    row.profile, row.quant, row.density, row.rate_hz
+                ),
+                format!(
+                    "{:.2} Mbit/s, {:.3}/255 rms, {:.2} dB, decode {:.3} ms, encode {:.3} ms",
+                    row.mbit_per_s,
+                    row.rmse_255,
+                    row.psnr_db.unwrap_or(f64::NAN),
+                    row.decode_ms,
+                    row.encode_ms
+                ),
+            ));
+        }
+        // A line a profile, density and rate; a point a quantiser.
+        let curves = |x: &dyn Fn(&Row) -> f64, y: &dyn Fn(&Row) -> f64| {
+            let mut curves: Vec<(String, Vec<(f64, f64)>)> = Vec::new();
+            for row in &self.rows {
+                let name = format!("{}, {}/m², {} Hz", row.profile, row.density, row.rate_hz);
+                if curves.last().is_none_or(|(last, _)| *last != name) {
+                    curves.push((name, Vec::new()));
+                }
+                let points = &mut curves.last_mut().expect("one was just made").1;
+                points.push((x(row), y(row)));
+            }
+            curves
+        };
+        let plot = |title: &str, x_label: &str, y_label: &str, series| Plot {
+            title: title.into(),
+            x_label: x_label.into(),
+            y_label: y_label.into(),
+            series,
+            log_y: true,
+            form: Form::Lines,
+        };
+        let rmse = |row: &Row| row.rmse_255;
+        let psnr = |row: &Row| row.psnr_db.unwrap_or(f64::NAN);
+        let (points, picture) = ("error of the points, rms (1/255)", "AO alone, PSNR (dB)");
+        let mut plots = vec![
+            plot(
+                "Bits and error of the points",
+                points,
+                "Mbit/s",
+                curves(&rmse, &|r| r.mbit_per_s),
+            ),
+            plot(
+                "Bits and error of the picture",
+                picture,
+                "Mbit/s",
+                curves(&psnr, &|r| r.mbit_per_s),
+            ),
+            plot(
+                "Decode time and error",
+                points,
+                "ms a frame",
+                curves(&rmse, &|r| r.decode_ms),
+            ),
+            plot(
+                "Encode time and error",
+                points,
+                "ms a frame",
+                curves(&rmse, &|r| r.encode_ms),
+            ),
+        ];
+        let mut over_time: BTreeMap<(u64, u64), Vec<(String, Vec<(f64, f64)>)>> = BTreeMap::new();
+        for (row, kbits) in self.rows.iter().zip(&self.kbits) {
+            let key = (row.density.to_bits(), row.rate_hz.to_bits());
+            let times = (0..).map(|frame| f64::from(frame) / row.rate_hz);
+            let name = format!("{} {}", row.profile, row.quant);
+            let line = times.zip(kbits.iter().copied()).collect();
+            over_time.entry(key).or_default().push((name, line));
+        }
+        for ((density, rate_hz), series) in over_time {
+            let (density, rate_hz) = (f64::from_bits(density), f64::from_bits(rate_hz));
+            let title = format!("Bits of each frame, {density}/m², {rate_hz} Hz");
+            plots.push(plot(&title, "time (s)", "kbit", series));
+        }
+        Report {
+            title: format!("PSAO eval: {scene}"),
+            summary,
+            panels: Vec::new(),
+            plots,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bits_are_interpolated_on_a_log_scale_and_extrapolation_is_said() {
+        let measured = [(2.0, 1.0), (1.0, 10.0), (4.0, 0.5)];
+        let at = |rmse| bits_at(rmse, &measured).expect("three points");
+        let near = |(bits, out): (f64, bool), want: f64, extrapolated| {
+            assert!((bits / want - 1.0).abs() < 1e-9, "{bits} instead of {want}");
+            assert_eq!(out, extrapolated);
+        };
+        near(at(1.0), 10.0, false);
+        near(at(1.5), 10f64.sqrt(), false);
+        near(at(2.0), 1.0, false);
+        near(at(3.0), 0.5f64.sqrt(), false);
+        near(at(4.0), 0.5, false);
+        near(at(0.0), 100.0, true);
+        near(at(6.0), 0.25, true);
+    }
+
+    #[test]
+    fn no_ratio_is_made_up_from_one_quantiser_or_none_or_silence() {
+        assert_eq!(bits_at(1.0, &[]), None);
+        assert_eq!(bits_at(1.0, &[(1.0, 5.0)]), None);
+        assert_eq!(bits_at(1.0, &[(1.0, 5.0), (1.0, 6.0)]), None);
+        assert_eq!(bits_at(1.0, &[(1.0, 5.0), (2.0, 0.0)]), None);
+    }
+
+    #[test]
+    fn steady_frames_leave_out_the_first_second_or_half() {
+        assert_eq!(left_out(600, 60.0), 60);
+        assert_eq!(left_out(90, 60.0), 45);
+        assert_eq!(left_out(10, 60.0), 5);
+        assert_eq!(left_out(10, 0.5), 1);
+        assert_eq!(left_out(2, 1000.0), 1);
+    }
+}
