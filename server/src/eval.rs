@@ -73,7 +73,7 @@ pub struct EvalArgs {
         long,
         value_name = "STEP[/DEADZONE],...",
         value_delimiter = ',',
-        default_value = "1/0,1,2,3,4,6,8",
+        default_value = "1/0,2,3,4,6,8",
         value_parser = parse_quantiser
     )]
     pub steps: Vec<Quantiser>,
@@ -610,11 +610,17 @@ fn percentile(values: &[f64], share: f64) -> f64 {
 }
 
 /// Mbit/s at a point error, from measured pairs of both: on straight lines through neighbouring
-/// pairs, with bits logarithmic. Also says whether the error is outside of them.
+/// pairs, with bits logarithmic. Pairs that another betters in both count for nothing. Also says
+/// whether the error is outside of the rest.
 fn bits_at(rmse: f64, measured: &[(f64, f64)]) -> Option<(f64, bool)> {
-    let mut pairs = measured.to_vec();
-    pairs.sort_by(|a, b| a.0.total_cmp(&b.0));
-    pairs.dedup_by(|a, b| a.0 == b.0);
+    let mut sorted = measured.to_vec();
+    sorted.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.total_cmp(&b.1)));
+    let mut pairs: Vec<(f64, f64)> = Vec::new();
+    for pair in sorted {
+        if pairs.last().is_none_or(|last| pair.1 < last.1) {
+            pairs.push(pair);
+        }
+    }
     if pairs.len() < 2 || pairs.iter().any(|(_, bits)| *bits <= 0.0) {
         return None;
     }
@@ -873,7 +879,8 @@ mod tests {
 
     #[test]
     fn bits_are_interpolated_on_a_log_scale_and_extrapolation_is_said() {
-        let measured = [(2.0, 1.0), (1.0, 10.0), (4.0, 0.5)];
+        // The last is worse than the first in both.
+        let measured = [(2.0, 1.0), (1.0, 10.0), (4.0, 0.5), (3.0, 2.0)];
         let at = |rmse| bits_at(rmse, &measured).expect("three points");
         let near = |(bits, out): (f64, bool), want: f64, extrapolated| {
             assert!((bits / want - 1.0).abs() < 1e-9, "{bits} instead of {want}");
