@@ -8,9 +8,13 @@ use psao::core::cell::{Bucket, Cell};
 use psao::core::grid::Instance;
 use psao::core::mirror::{Capacity, MirrorError};
 use psao::core::point::{Point, encode_normal};
+use psao::core::residual::{
+    MAX_SLICE_BYTES, Neighbours, Quantiser, SliceState, encode_slice, find_neighbours,
+};
+use psao::core::slices::{Item, Values, apply_slices, store};
 use psao::core::stream::{
     self, FRAME_HEADER_BYTES, Frame, Header, MAX_BODY_BYTES, MAX_RAW_BYTES, PACKET_HEADER_BYTES,
-    PREAMBLE, Packet, Refusal, StreamError, Writer, flag, kind, write_packet,
+    PREAMBLE, Packet, Profile, Refusal, StreamError, Writer, flag, kind, write_packet,
 };
 use psao::core::uplink::{self, Camera, Hello, MAX_UPLINK_BODY_BYTES, Message, Transform};
 use psao::{Client, ClientError, Config, State};
@@ -25,6 +29,7 @@ use std::sync::LazyLock;
 // ---------------------------------------------------------------- streams to read
 
 /// A stream, and what its readers must show.
+#[derive(Clone)]
 struct Sample {
     bytes: Vec<u8>,
     room: Capacity,
@@ -119,21 +124,24 @@ fn cuboid(name: &str, size: Vec3) -> Mesh {
     mesh
 }
 
-fn world(density: f64) -> World {
+fn world(density: f64, scheme: Scheme) -> World {
     let options = Options {
         density,
         rays: 32,
+        rest_space: matches!(scheme, Scheme::Residual(_)),
         ..Options::of(psao::core::Kernel::Planar)
     };
     World::new(scene(), options, &|_, _, _| ()).unwrap()
 }
 
 /// What a server sends of [`scene`]: `frames` frames, a snapshot again at the fifth, and an end.
-fn serve(density: f64, frames: u32) -> Sample {
-    let mut world = world(density);
-    let mut encoder = Encoder::new(&world, CELLS);
+/// In profile `residual` the view turns: boxes left of a line that moves to the right are seen.
+fn serve(density: f64, scheme: Scheme, frames: u32) -> Sample {
+    let mut world = world(density, scheme);
+    let mut encoder = Encoder::new(&world, scheme);
     let mut bytes = encoder.header(&world, world.scene.hash(), 30.0);
     let mut mirrors = HashMap::new();
+    let mut cells_sent = Vec::new();
     for frame in 0..frames {
         let time_s = f64::from(frame) * 0.09;
         world.step(time_s, &|_| true, u64::MAX);
@@ -142,11 +150,23 @@ fn serve(density: f64, frames: u32) -> Sample {
         if frame == 4 {
             encoder.resync();
         }
-        let sent = encoder.frame(&world, (time_s * 1e9) as u64, &|_| true, true, &mut bytes);
-        assert!(sent.cells > 0, "frame {frame} is meant to change something");
+        let line = -0.25 + 0.12 * frame as f32;
+        let seen = |bounds: [Vec3; 2]| scheme == CELLS || bounds[0].midpoint(bounds[1]).x < line;
+        let sent = encoder.frame(&world, (time_s * 1e9) as u64, &seen, true, &mut bytes);
+        let changed = sent.cells + sent.slices;
+        assert!(changed > 0, "frame {frame} is meant to change something");
+        cells_sent.push(sent.cells);
         mirrors.insert(encoder.frame_id(), contents(encoder.mirror()));
     }
     encoder.end(&mut bytes);
+    if let Scheme::Residual(_) = scheme {
+        let opened = cells_sent.iter().filter(|cells| **cells > 0).count();
+        assert!(
+            opened > 2,
+            "slices are meant to open over time: {cells_sent:?}"
+        );
+        assert!(cells_sent.contains(&0) || frames < 8, "{cells_sent:?}");
+    }
     Sample {
         bytes,
         room: capacity_of(&world.truth),
@@ -162,7 +182,13 @@ fn contents<M: psao::core::mirror::Memory>(mirror: &psao::core::Mirror<M>) -> [V
     ]
 }
 
-static SERVED: LazyLock<Sample> = LazyLock::new(|| serve(24.0, 6));
+static SERVED: LazyLock<Sample> = LazyLock::new(|| serve(24.0, CELLS, 6));
+
+const RESIDUAL: Scheme = Scheme::Residual(Quantiser {
+    step: 3,
+    dead_zone: 2,
+});
+static SERVED_RESIDUAL: LazyLock<Sample> = LazyLock::new(|| serve(24.0, RESIDUAL, 8));
 
 /// Writes streams by hand, and so others than the server's encoder would.
 #[derive(Clone)]
@@ -223,6 +249,14 @@ impl Hand {
     }
 
     fn compressed(&mut self, flags: u8, id: u32, hash: u64, raw_bytes: u32, content: &[u8]) {
+        self.part(kind::FRAME, flags, id, hash, raw_bytes, content);
+    }
+
+    fn slices(&mut self, flags: u8, id: u32, hash: u64, items: &[u8]) {
+        self.part(kind::SLICES, flags, id, hash, items.len() as u32, items);
+    }
+
+    fn part(&mut self, kind: u8, flags: u8, id: u32, hash: u64, raw_bytes: u32, content: &[u8]) {
         let frame = Frame {
             id,
             time_ns: u64::from(id) * 1000,
@@ -232,7 +266,7 @@ impl Hand {
         let mut body = vec![0; FRAME_HEADER_BYTES];
         frame.write(&mut Writer::new(&mut body)).unwrap();
         body.extend_from_slice(content);
-        self.packet(kind::FRAME, flags, &body);
+        self.packet(kind, flags, &body);
     }
 }
 
@@ -246,7 +280,7 @@ fn content(
     buckets: &[(u32, Bucket)],
     cells: &[(u32, Cell)],
 ) -> Vec<u8> {
-    let mut raw = vec![0; 4096];
+    let mut raw = vec![0; 12 + 68 * instances.len() + 36 * (buckets.len() + cells.len())];
     let mut w = Writer::new(&mut raw);
     for count in [instances.len(), buckets.len(), cells.len()] {
         w.u32(count as u32).unwrap();
@@ -254,8 +288,7 @@ fn content(
     w.list(instances).unwrap();
     w.list(buckets).unwrap();
     w.list(cells).unwrap();
-    let length = w.length();
-    raw.truncate(length);
+    assert_eq!(w.length(), raw.len());
     raw
 }
 
@@ -334,6 +367,190 @@ fn by_hand() -> Sample {
         room: Hand::ROOM,
         mirrors,
     }
+}
+
+// ---------------------------------------------------------------- profile residual by hand
+
+/// The server's side of profile `residual`, over integers alone: the same on every machine.
+struct Coded {
+    mirror: psao::core::Mirror<psao::memory::Heap>,
+    slices: psao::memory::SliceHeap,
+}
+
+impl Coded {
+    fn new(header: &Header) -> Coded {
+        Coded {
+            mirror: psao::core::Mirror::new(psao::memory::Heap::new(header.capacity)),
+            slices: psao::memory::SliceHeap::new(header.slices, header.points),
+        }
+    }
+
+    fn reset(&mut self) {
+        self.mirror.reset();
+        self.slices.slices().reset();
+    }
+
+    /// The data of an item that brings a slice to `target`: of a number of its points.
+    fn code(
+        &mut self,
+        index: u32,
+        opens: Option<[u32; 3]>,
+        step: u8,
+        target: &dyn Fn(usize) -> u8,
+    ) -> Vec<u8> {
+        let mut slices = self.slices.slices();
+        if let Some([instance, first, count]) = opens {
+            slices
+                .open(&self.mirror, index, instance, first, count)
+                .unwrap();
+        }
+        let (slice, neighbours, last) = slices.side(index).unwrap();
+        let cells = slice.cell_first as usize..(slice.cell_first + slice.cell_count) as usize;
+        let mut values = Values::of(&self.mirror.cells()[cells]).unwrap();
+        let target: Vec<u8> = (0..slice.point_count as usize).map(target).collect();
+        let quantiser = Quantiser {
+            step,
+            dead_zone: step / 2,
+        };
+        let mut state = SliceState {
+            value: values.get_mut(),
+            last,
+        };
+        let mut data = vec![0; MAX_SLICE_BYTES];
+        let first = opens.is_some();
+        let length = encode_slice(neighbours, quantiser, &mut state, &target, first, &mut data);
+        data.truncate(length.unwrap());
+        store(&mut self.mirror, slice, values.get()).unwrap();
+        data
+    }
+}
+
+/// Items as a packet holds them.
+fn items(items: &[(u32, Option<[u32; 3]>, Vec<u8>)]) -> Vec<u8> {
+    let mut out = vec![0; items.iter().map(|item| item.2.len() + 32).sum()];
+    let mut w = Writer::new(&mut out);
+    let mut next = 0;
+    for (index, opens, bytes) in items {
+        let (index, opens) = (*index, *opens);
+        Item {
+            index,
+            opens,
+            bytes,
+        }
+        .write(next, &mut w)
+        .unwrap();
+        next = index + 1;
+    }
+    let length = w.length();
+    out.truncate(length);
+    out
+}
+
+/// What to make: cells a slice, slices, frames.
+type Made = [u32; 3];
+const MADE_SMALL: Made = [5, 3, 7];
+const MADE_LARGE: Made = [180, 4, 30];
+
+fn made_header([cells, slices, _]: Made) -> Header {
+    let cells: Vec<Cell> = (1..=cells * slices).map(made_cell).collect();
+    Header {
+        profile: Profile::Residual,
+        step: 3,
+        slices,
+        points: cells.iter().map(|cell| cell.len() as u32).sum(),
+        capacity: Capacity {
+            cells: cells.len() as u32 + 1,
+            ..Hand::ROOM
+        },
+        max_body_bytes: 1 << 16,
+        max_raw_bytes: 1 << 16,
+        ..Hand::header()
+    }
+}
+
+/// Four to seven points.
+fn made_cell(index: u32) -> Cell {
+    let mut random = Random(index.into());
+    let mut cell = Cell {
+        key: index - 1,
+        ..Cell::default()
+    };
+    for place in 0..4 + index as usize % 4 {
+        let position = std::array::from_fn(|_| random.below(32) as u32);
+        let normal = [0x77, 0x77, 0xe7, random.below(256) as u8][random.below(4)];
+        cell.points[place] = Point::pack(position, normal, index as u8);
+    }
+    cell
+}
+
+/// A shadow wanders over slices that open one after the other; after two thirds of the frames a
+/// snapshot. In some frames some slices stay as they are.
+fn made(what: Made) -> Sample {
+    let [cells, slices, frames] = what;
+    let header = made_header(what);
+    let mut hand = Hand::with(&header);
+    let mut coded = Coded::new(&header);
+    let mut mirrors = HashMap::new();
+    let mut random = Random(9);
+    let grid = Instance {
+        dims: [8, 8, 1000],
+        ..grid()
+    };
+    let mut open = 0;
+    for frame in 0..frames {
+        let snapshot = frame == 0 || frame == frames * 2 / 3;
+        let opened = if snapshot { 0 } else { open };
+        open = (frame / 2 + 1).min(slices);
+        let mut changes: Vec<(u32, Cell)> = Vec::new();
+        for index in opened * cells + 1..=open * cells {
+            changes.push((index, made_cell(index)));
+        }
+        let mut flags = 0;
+        if snapshot {
+            coded.reset();
+            flags |= flag::SNAPSHOT;
+        }
+        if !changes.is_empty() {
+            let instances: &[_] = if snapshot { &[(0, grid)] } else { &[] };
+            let raw = content(instances, &[(0, bucket(&[1, 2, 3]))], &changes);
+            stream::apply_changes(&raw, &mut coded.mirror).unwrap();
+            hand.frame(flags, frame + 1, 0, &raw);
+        }
+        let noise = random.below(1000);
+        let target = |at: usize| {
+            let off = (at * 11).abs_diff(frame as usize * 60) as u8 as usize;
+            let dark = 200usize.saturating_sub(off) + (at * 7 + noise) % 5;
+            255 - if dark > 4 { dark as u8 } else { 0 }
+        };
+        let mut list = Vec::new();
+        for index in 0..open {
+            let opens = (index >= opened).then_some([0, index * cells + 1, cells]);
+            if opens.is_some() || (index + frame) % 3 != 0 {
+                list.push((index, opens, coded.code(index, opens, header.step, &target)));
+            }
+        }
+        // The last frame in two packets, the second without anything.
+        let hash = coded.mirror.hash();
+        if frame + 1 == frames {
+            hand.slices(0, frame + 1, 0, &items(&list));
+            hand.slices(flag::LAST, frame + 1, hash, &[]);
+        } else {
+            hand.slices(flag::LAST, frame + 1, hash, &items(&list));
+        }
+        mirrors.insert(frame + 1, contents(&coded.mirror));
+    }
+    hand.packet(kind::END, 0, &[]);
+    Sample {
+        bytes: hand.bytes,
+        room: header.capacity,
+        mirrors,
+    }
+}
+
+/// All samples that are small enough to be damaged in every place.
+fn samples() -> [Sample; 4] {
+    let made = made(MADE_SMALL);
+    [SERVED.clone(), SERVED_RESIDUAL.clone(), by_hand(), made]
 }
 
 fn config(capacity: Capacity) -> Config {
@@ -502,6 +719,22 @@ fn both_readers_show_what_the_server_has_frame_by_frame() {
     assert_eq!(ids, [1, 2, 3, 4, 5, 6]);
     assert!(outcome.ended && outcome.error.is_none() && outcome.mismatches == 0);
 
+    let outcome = agreed_on(&SERVED_RESIDUAL);
+    assert_eq!((outcome.shown.len(), outcome.mismatches), (8, 0));
+    assert!(outcome.ended && outcome.error.is_none());
+    // Several slices an instance.
+    let sample = serve(1500.0, RESIDUAL, 6);
+    let mut client = Client::new(config(sample.room));
+    client.push(&sample.bytes[..100]).unwrap();
+    assert!(client.header().is_some_and(|header| header.slices > 5));
+    let outcome = agreed_on(&sample);
+    assert_eq!((outcome.shown.len(), outcome.error), (6, None));
+    for what in [MADE_SMALL, MADE_LARGE] {
+        let outcome = agreed_on(&made(what));
+        assert_eq!(outcome.shown.len() as u32, what[2]);
+        assert!(outcome.ended && outcome.error.is_none());
+    }
+
     let outcome = agreed_on(&by_hand());
     let ids: Vec<u32> = outcome.shown.iter().map(|shown| shown.0).collect();
     assert_eq!(ids, [41, 42, 43]);
@@ -510,7 +743,7 @@ fn both_readers_show_what_the_server_has_frame_by_frame() {
 
 #[test]
 fn a_frame_too_large_for_one_packet_comes_in_several() {
-    let sample = serve(10_000.0, 1);
+    let sample = serve(10_000.0, CELLS, 1);
     let packets = packets(&sample.bytes);
     assert!(packets.len() > 3, "{} packets", packets.len());
     let outcome = agreed_on(&sample);
@@ -521,14 +754,17 @@ fn a_frame_too_large_for_one_packet_comes_in_several() {
 fn a_stream_does_not_depend_on_the_number_of_threads() {
     let on = |threads| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
-        pool.unwrap().install(|| serve(24.0, 6).bytes)
+        let pool = pool.unwrap();
+        [(CELLS, 6), (RESIDUAL, 8)]
+            .map(|(scheme, frames)| pool.install(|| serve(24.0, scheme, frames).bytes))
     };
-    assert!(on(1) == SERVED.bytes && on(7) == SERVED.bytes);
+    let bytes = [SERVED.bytes.clone(), SERVED_RESIDUAL.bytes.clone()];
+    assert!(on(1) == bytes && on(7) == bytes);
 }
 
 #[test]
 fn however_a_stream_is_cut_its_frames_are_the_same() {
-    for sample in [&*SERVED, &by_hand()] {
+    for sample in samples() {
         let mut client = Client::new(config(sample.room));
         let whole = read(&mut client, &sample.bytes, usize::MAX, |_, _| ());
         for portion in [1, 2, 15, 16, 17, 1000] {
@@ -542,7 +778,7 @@ fn however_a_stream_is_cut_its_frames_are_the_same() {
 
 #[test]
 fn every_prefix_of_a_stream_shows_the_frames_that_are_whole_in_it() {
-    for sample in [&*SERVED, &by_hand()] {
+    for sample in samples() {
         // Where each frame ends, from pushing byte by byte.
         let mut client = Client::new(config(sample.room));
         let mut ends = Vec::new();
@@ -566,7 +802,7 @@ fn every_prefix_of_a_stream_shows_the_frames_that_are_whole_in_it() {
 #[test]
 fn nothing_may_follow_the_end() {
     // [3.2]
-    for sample in [&*SERVED, &by_hand()] {
+    for sample in samples() {
         let mut client = Client::new(config(sample.room));
         let mut longer = sample.bytes.clone();
         longer.push(0);
@@ -580,7 +816,7 @@ fn nothing_may_follow_the_end() {
 
 #[test]
 fn every_flipped_bit_is_an_error_or_withholds_frames() {
-    for sample in [&*SERVED, &by_hand()] {
+    for sample in samples() {
         let mut client = Client::new(config(sample.room));
         let good = read(&mut client, &sample.bytes, usize::MAX, |_, _| ());
         let mut bytes = sample.bytes.clone();
@@ -609,7 +845,7 @@ fn every_flipped_bit_is_an_error_or_withholds_frames() {
 #[test]
 fn lost_repeated_and_swapped_packets_are_noticed() {
     // [2.7]
-    for sample in [&*SERVED, &by_hand()] {
+    for sample in samples() {
         let mut client = Client::new(config(sample.room));
         let places = packets(&sample.bytes);
         let list: Vec<&[u8]> = places.iter().map(|p| &sample.bytes[p.clone()]).collect();
@@ -703,17 +939,17 @@ fn what_is_out_of_place_is_refused() {
         )
         .error
     };
-    for kind in [kind::FRAME, kind::END, 99] {
+    for kind in [kind::FRAME, kind::SLICES, kind::END, 99] {
         let mut hand = Hand::bare();
         hand.packet(kind, 0, &[0; 24]);
         assert_eq!(error(&hand), order, "kind {kind} before the header");
     }
-    for kind in [kind::HEADER, kind::REFUSE] {
+    for kind in [kind::HEADER, kind::REFUSE, kind::SLICES] {
         let mut hand = Hand::new();
         hand.packet(kind, 0, &[1; 60]);
         assert_eq!(error(&hand), order, "kind {kind} after the header");
     }
-    for kind in [0, 5, 6, 64, 99, 255] {
+    for kind in [0, 6, 15, 64, 99, 255] {
         let mut hand = Hand::new();
         hand.packet(kind, 0, &[]);
         assert_eq!(error(&hand), Some(StreamError::Kind(kind).into()));
@@ -750,7 +986,7 @@ fn headers_outside_their_ranges_are_refused_and_named() {
     };
     says(0, 2, "stream version 2");
     says(1, 1, "stream version 257");
-    says(4, 1, "stream profile 1");
+    says(4, 2, "stream profile 2");
     for (at, value) in [
         (5, 2),
         (6, 8),
@@ -759,9 +995,13 @@ fn headers_outside_their_ranges_are_refused_and_named() {
         (31, 1),
         (35, 1),
         (39, 0xff),
+        (4, 1),
         (49, 1),
         (50, 1),
         (51, 1),
+        (52, 1),
+        (55, 1),
+        (56, 1),
     ] {
         says(at, value, "outside its range");
     }
@@ -788,7 +1028,7 @@ fn headers_outside_their_ranges_are_refused_and_named() {
     body.extend([9; 20]);
     hand.packet(kind::HEADER, 0, &body);
     assert_eq!(error(&hand.bytes), None);
-    for length in 0..52 {
+    for length in 0..60 {
         let mut hand = Hand::bare();
         hand.packet(kind::HEADER, 0, &body[..length]);
         assert!(error(&hand.bytes).is_some(), "{length} bytes");
@@ -1011,12 +1251,458 @@ fn content_is_exactly_one_zstd_frame() {
     );
 }
 
+// ---------------------------------------------------------------- slices
+
+#[test]
+fn normals_and_neighbours_are_those_of_the_integer_rule() {
+    // [15.6]
+    for code in 0..=255u8 {
+        let steps = second_reader::normal_steps(code);
+        let normal = psao::core::point::decode_normal(code);
+        for axis in 0..3 {
+            assert_eq!(steps[axis], (normal[axis] * 127.0) as i64, "code {code}");
+        }
+    }
+    let mut random = Random(5);
+    // From points on top of each other, which are all equally near, to points far outside any grid.
+    for spread in [1, 2, 3, 20, 400, 1 << 15, 1 << 20, u32::MAX as usize] {
+        for count in [0, 1, 2, 3, 4, 130, 131, 1024] {
+            let points: Vec<([u32; 3], u8)> = (0..count)
+                .map(|_| {
+                    let place = std::array::from_fn(|_| random.below(spread) as u32);
+                    (place, random.below(256) as u8)
+                })
+                .collect();
+            let (places, normals): (Vec<_>, Vec<_>) = points.iter().copied().unzip();
+            let mut found = vec![Neighbours::default(); count];
+            find_neighbours(&places, &normals, &mut found);
+            let (earlier, later) = second_reader::neighbours(&points);
+            for at in 0..count {
+                let said = |others: &[usize]| {
+                    let mut far = [0; 3];
+                    for (far, other) in far.iter_mut().zip(others) {
+                        *far = at.abs_diff(*other) as u8;
+                    }
+                    far
+                };
+                let expected = Neighbours {
+                    earlier: said(&earlier[at]),
+                    later: said(&later[at]),
+                };
+                assert_eq!(found[at], expected, "{at} of {count}, spread {spread}");
+            }
+        }
+    }
+}
+
+/// FNV-1a.
+fn fingerprint(parts: impl IntoIterator<Item = u64>) -> u64 {
+    let bytes = parts.into_iter().flat_map(u64::to_le_bytes);
+    bytes.fold(0xcbf2_9ce4_8422_2325, |hash, byte| {
+        (hash ^ u64::from(byte)).wrapping_mul(0x100_0000_01b3)
+    })
+}
+
+#[test]
+fn a_made_stream_decodes_to_the_same_mirrors_on_every_machine() {
+    // [13.1] The hashes of all frames: integers alone lead to them.
+    let outcome = agreed_on(&made(MADE_LARGE));
+    let hashes = outcome.shown.iter().map(|shown| shown.2);
+    assert_eq!(fingerprint(hashes), 16595390487211099106);
+}
+
+/// A stream with cells 1 to 5 of 1, 2, 3, 7 and 7 points, the last two of them in an instance
+/// without points; three slices, room for 13 points.
+fn slices_header() -> Header {
+    Header {
+        profile: Profile::Residual,
+        step: 3,
+        slices: 3,
+        points: 13,
+        ..Hand::header()
+    }
+}
+
+fn slices_content() -> Vec<u8> {
+    let with = |index: u32, count: usize| {
+        let mut cell = cell(index);
+        for place in 0..count {
+            cell.points[place] = Point::pack([place as u32 * 4, 2, 3], 0x77, 9);
+        }
+        (index, cell)
+    };
+    let cells = [(1, 1), (2, 2), (3, 3), (4, 7), (5, 7)].map(|(index, count)| with(index, count));
+    content(&[(0, grid())], &[(0, bucket(&[1, 2, 3]))], &cells)
+}
+
+/// What the readers say of a snapshot with [`slices_content`] and a frame of these packets of
+/// items, with the hash that the mirror then has.
+fn slices_outcome(header: &Header, parts: &[Vec<u8>]) -> Outcome {
+    let mut coded = Coded::new(header);
+    let raw = slices_content();
+    stream::apply_changes(&raw, &mut coded.mirror).unwrap();
+    let mut hand = Hand::with(header);
+    hand.frame(flag::SNAPSHOT | flag::LAST, 1, coded.mirror.hash(), &raw);
+    for part in parts {
+        let slices = &mut coded.slices.slices();
+        let applied = apply_slices(part, header.step, &mut coded.mirror, slices);
+        hand.slices(0, 2, 0, part);
+        if applied.is_err() {
+            break;
+        }
+    }
+    hand.slices(flag::LAST, 2, coded.mirror.hash(), &[]);
+    let mut client = Client::new(config(Hand::ROOM));
+    let outcome = agreed(&mut client, &hand.bytes, Hand::ROOM);
+    assert_eq!(outcome.mismatches, 0);
+    let whole = outcome.error.is_none();
+    assert_eq!(outcome.shown.len(), 1 + usize::from(whole));
+    outcome
+}
+
+#[test]
+fn items_that_do_not_fit_are_refused() {
+    // [15.2 to 15.4]
+    let header = slices_header();
+    let error = |parts: &[Vec<u8>]| slices_outcome(&header, parts).error;
+    let value = Some(ClientError::Stream(StreamError::Value));
+    let order = Some(ClientError::Stream(StreamError::Order));
+    let length = Some(ClientError::Stream(StreamError::Length));
+    // All points open, or as they were: one decision a block, and the same data for all.
+    let still = |first| {
+        let (mut value, mut last) = ([255; 16], [0; 16]);
+        let mut state = SliceState {
+            value: &mut value,
+            last: &mut last,
+        };
+        let quantiser = Quantiser {
+            step: 3,
+            dead_zone: 0,
+        };
+        let mut data = vec![0; 16];
+        let neighbours = [Neighbours::default(); 16];
+        let length = encode_slice(
+            &neighbours,
+            quantiser,
+            &mut state,
+            &[255; 16],
+            first,
+            &mut data,
+        );
+        data.truncate(length.unwrap());
+        data
+    };
+    let (opened, unchanged) = (still(true), still(false));
+    let open = |index, opens| items(&[(index, Some(opens), opened.clone())]);
+    let good = open(0, [0, 1, 2]);
+    assert_eq!(error(std::slice::from_ref(&good)), None);
+    assert_eq!(error(&[open(2, [0, 1, 3])]), None);
+    let later = items(&[(0, None, unchanged.clone())]);
+    assert_eq!(error(&[good.clone(), later.clone()]), None);
+
+    assert_eq!(error(&[later]), order, "not open");
+    assert_eq!(error(&[good.clone(), good.clone()]), order, "open already");
+    assert_eq!(error(&[open(3, [0, 1, 1])]), value, "no such slice");
+    assert_eq!(error(&[items(&[(3, None, unchanged.clone())])]), order);
+    assert_eq!(error(&[open(0, [1, 1, 1])]), value, "no points in it");
+    assert_eq!(error(&[open(0, [2, 1, 1])]), value, "no such instance");
+    assert_eq!(error(&[open(0, [0, 1, 0])]), order, "no cells");
+    for (first, count) in [
+        (0, 1),
+        (0, 2),
+        (1, 6),
+        (6, 1),
+        (8, 2),
+        (9, 1),
+        (u32::MAX, 1),
+    ] {
+        assert_eq!(error(&[open(0, [0, first, count])]), value, "cell {first}");
+    }
+    for count in [u32::MAX, u32::MAX - 1] {
+        assert_eq!(error(&[open(0, [0, 2, count])]), value, "{count} cells");
+    }
+    // 7 + 6 points are as many as there may be, one more is not.
+    assert_eq!(error(&[open(0, [0, 4, 1]), open(1, [0, 1, 3])]), None);
+    assert_eq!(error(&[open(0, [0, 4, 2])]), value);
+    let too_many = [open(0, [0, 4, 1]), open(1, [0, 1, 3]), open(2, [0, 1, 1])];
+    assert_eq!(error(&too_many), value);
+
+    let varint = |value: u32| {
+        let mut bytes = [0; 5];
+        let mut w = Writer::new(&mut bytes);
+        w.varint(value).unwrap();
+        let length = w.length();
+        bytes[..length].to_vec()
+    };
+    for gap in [3, 1 << 20, u32::MAX / 2] {
+        let far = [varint(gap << 1 | 1), vec![0, 1, 1, 0]].concat();
+        assert_eq!(error(&[far]), value, "a gap of {gap}");
+        assert_eq!(error(&[[varint(gap << 1), vec![0]].concat()]), order);
+        assert_eq!(
+            error(&[[good.clone(), varint(gap << 1), vec![0]].concat()]),
+            order
+        );
+    }
+    // Numbers in more bytes than they need are read; those that are too long or large are not.
+    let size = opened.len() as u8;
+    let long = [
+        0x81,
+        0,
+        0x80,
+        0,
+        1,
+        0x82,
+        0x80,
+        0x80,
+        0x80,
+        0,
+        size | 0x80,
+        0,
+    ];
+    assert_eq!(error(&[[&long[..], &opened].concat()]), None);
+    let too_long = [1, 0, 1, 2, size | 0x80, 0x80, 0x80, 0x80, 0x80, 0];
+    assert_eq!(error(&[[&too_long[..], &opened].concat()]), value);
+    let too_large = [1, 0, 1, 2, 0xff, 0xff, 0xff, 0xff, 0x10];
+    assert_eq!(error(&[[&too_large[..], &opened].concat()]), value);
+    for short in 1..good.len() {
+        assert_eq!(error(&[good[..short].to_vec()]), length, "{short} bytes");
+    }
+    assert_eq!(error(&[[&good[..], &[0x80]].concat()]), length);
+    // The data itself ends too early, or too late [15.5].
+    for data in [vec![], [&opened[..], &[0]].concat(), vec![0xff; 9]] {
+        let list = items(&[(0, Some([0, 1, 2]), data)]);
+        assert_eq!(error(&[list]), length);
+    }
+
+    let mut longer = Hand::with(&header);
+    longer.part(kind::SLICES, flag::SNAPSHOT | flag::LAST, 1, 0, 1, &[]);
+    let mut client = Client::new(config(Hand::ROOM));
+    let outcome = agreed(&mut client, &longer.bytes, Hand::ROOM);
+    assert_eq!(outcome.error, length);
+}
+
+#[test]
+fn a_slice_has_at_most_1024_points() {
+    // [15.3] 4 to 7 points a cell, 5.5 in the mean.
+    let mut header = made_header([250, 1, 1]);
+    let cells: Vec<(u32, Cell)> = (1..=250).map(|index| (index, made_cell(index))).collect();
+    let raw = content(&[(0, grid())], &[], &cells);
+    let mut points = 0;
+    let fit = cells.iter().take_while(|(_, cell)| {
+        points += cell.len();
+        points <= 1024
+    });
+    let fit = fit.count() as u32;
+    header.slices = 1;
+    for (count, good) in [(fit, true), (fit + 1, false), (250, false)] {
+        let mut coded = Coded::new(&header);
+        stream::apply_changes(&raw, &mut coded.mirror).unwrap();
+        let data = if good {
+            coded.code(0, Some([0, 1, count]), 3, &|at| at as u8)
+        } else {
+            Vec::new()
+        };
+        let mut hand = Hand::with(&header);
+        hand.frame(flag::SNAPSHOT, 1, 0, &raw);
+        let list = items(&[(0, Some([0, 1, count]), data)]);
+        hand.slices(flag::LAST, 1, coded.mirror.hash(), &list);
+        let mut client = Client::new(config(header.capacity));
+        let outcome = agreed(&mut client, &hand.bytes, header.capacity);
+        assert_eq!(outcome.shown.len(), usize::from(good), "{count} cells");
+        assert_eq!(outcome.error.is_none(), good, "{count} cells");
+    }
+}
+
+#[test]
+fn slices_over_the_same_cells_and_cells_that_come_again_say_what_came_last() {
+    // [15.4]
+    let header = slices_header();
+    let mut coded = Coded::new(&header);
+    let raw = slices_content();
+    stream::apply_changes(&raw, &mut coded.mirror).unwrap();
+    let mut hand = Hand::with(&header);
+    hand.frame(flag::SNAPSHOT, 1, 0, &raw);
+    let [a, b] = [Some([0, 1, 3]), Some([0, 2, 2])];
+    let first = [
+        (0, a, coded.code(0, a, 3, &|at| 200 - at as u8 * 9)),
+        (1, b, coded.code(1, b, 3, &|at| 90 + at as u8 * 7)),
+        // In another packet, since indices rise.
+        (0, None, coded.code(0, None, 3, &|at| 30 + at as u8)),
+    ];
+    hand.slices(0, 1, 0, &items(&first[..2]));
+    hand.slices(flag::LAST, 1, coded.mirror.hash(), &items(&first[2..]));
+    // Cells of the slices come again: with as many points at other places, then with fewer.
+    let mut again = cell(2);
+    again.points[1] = Point::pack([9; 3], 0xe7, 77);
+    let raw = content(&[], &[], &[(2, again)]);
+    stream::apply_changes(&raw, &mut coded.mirror).unwrap();
+    hand.frame(0, 2, 0, &raw);
+    let second = [
+        (0, None, coded.code(0, None, 3, &|at| 60 + at as u8 * 20)),
+        (1, None, coded.code(1, None, 3, &|at| 250 - at as u8 * 20)),
+    ];
+    hand.slices(flag::LAST, 2, coded.mirror.hash(), &items(&second));
+    let mut fewer = hand.clone();
+    hand.packet(kind::END, 0, &[]);
+    let outcome = agreed(
+        &mut Client::new(config(Hand::ROOM)),
+        &hand.bytes,
+        Hand::ROOM,
+    );
+    assert_eq!((outcome.shown.len(), outcome.error), (2, None));
+
+    fewer.frame(0, 3, 0, &content(&[], &[], &[(3, cell(3))]));
+    fewer.slices(flag::LAST, 3, 0, &items(&[(1, None, Vec::new())]));
+    let outcome = agreed(
+        &mut Client::new(config(Hand::ROOM)),
+        &fewer.bytes,
+        Hand::ROOM,
+    );
+    assert_eq!(outcome.error, Some(StreamError::Value.into()));
+}
+
+#[test]
+fn a_lost_packet_of_slices_never_shows_a_wrong_mirror_even_where_the_sequence_is_right() {
+    for sample in [made(MADE_SMALL), SERVED_RESIDUAL.clone()] {
+        let list: Vec<(u8, u8, Vec<u8>)> = packets(&sample.bytes)
+            .into_iter()
+            .map(|place| {
+                let bytes = &sample.bytes[place];
+                let (packet, _) = Packet::read(bytes, MAX_BODY_BYTES).unwrap().unwrap();
+                (packet.kind, packet.flags, packet.body.to_vec())
+            })
+            .collect();
+        let mut client = Client::new(config(sample.room));
+        let right = hashes(&sample);
+        let mut noticed = 0;
+        for at in 1..list.len() {
+            for swap in [false, true] {
+                let mut list = list.clone();
+                if !swap {
+                    list.remove(at);
+                } else if at + 1 < list.len() {
+                    list.swap(at, at + 1);
+                }
+                let mut hand = Hand::bare();
+                for (kind, flags, body) in &list {
+                    hand.packet(*kind, *flags, body);
+                }
+                let outcome = agreed_with(&mut client, &hand.bytes, &sample, &right);
+                noticed += usize::from(outcome.error.is_some() || outcome.mismatches > 0);
+            }
+        }
+        assert!(noticed > list.len(), "{noticed} of {}", 2 * list.len());
+    }
+}
+
+#[test]
+fn every_flipped_bit_behind_a_right_checksum_never_shows_a_wrong_mirror() {
+    for sample in [made(MADE_SMALL), SERVED_RESIDUAL.clone()] {
+        let mut client = Client::new(config(sample.room));
+        let right = hashes(&sample);
+        let (mut errors, mut withheld, mut shown) = (0, 0, 0);
+        for place in packets(&sample.bytes) {
+            for bit in 8 * place.start..8 * place.end {
+                let mut bytes = sample.bytes.clone();
+                bytes[bit / 8] ^= 1 << (bit % 8);
+                mend(&mut bytes);
+                let outcome = agreed_with(&mut client, &bytes, &sample, &right);
+                errors += usize::from(outcome.error.is_some());
+                withheld += usize::from(outcome.mismatches > 0);
+                shown += outcome.shown.len();
+            }
+        }
+        assert!(
+            errors > 1000 && withheld > 100,
+            "{errors}, {withheld}, {shown}"
+        );
+    }
+}
+
+/// [`agreed`], and what is shown are mirrors of the sample, though perhaps of other frames. (That a
+/// mirror has the hash that it is shown with is checked in [`read`].)
+fn agreed_with(client: &mut Client, bytes: &[u8], sample: &Sample, right: &[u64]) -> Outcome {
+    let outcome = agreed(client, bytes, sample.room);
+    for (id, _, hash) in &outcome.shown {
+        assert!(right.contains(hash), "frame {id} is wrong");
+    }
+    outcome
+}
+
+/// The hashes of a sample's mirrors.
+fn hashes(sample: &Sample) -> Vec<u64> {
+    let shown = agreed_on(sample).shown;
+    shown.into_iter().map(|shown| shown.2).collect()
+}
+
+#[test]
+fn thirty_thousand_damaged_streams_of_slices_end_as_both_readers_agree() {
+    let sample = made(MADE_SMALL);
+    let most = most_bytes(sample.room);
+    let run = |seed: u64| {
+        let mut random = Random(seed);
+        let mut client = Client::new(config(sample.room));
+        let (mut errors, mut shown, mut withheld) = (0, 0, 0);
+        for _ in 0..15_000 {
+            let mut bytes = sample.bytes.clone();
+            for _ in 0..1 + random.below(3) {
+                if !bytes.is_empty() {
+                    damage(&mut bytes, &mut random);
+                }
+            }
+            mend(&mut bytes);
+            let outcome = agreed(&mut client, &bytes, sample.room);
+            errors += usize::from(outcome.error.is_some());
+            withheld += outcome.mismatches;
+            shown += outcome.shown.len();
+            assert!(client.memory_bytes() <= most);
+        }
+        assert!(
+            errors > 3000 && shown > 3000 && withheld > 100,
+            "the damage is meant to be of all kinds: {errors}, {shown}, {withheld}"
+        );
+    };
+    std::thread::scope(|scope| {
+        for seed in [11, 12] {
+            let run = &run;
+            scope.spawn(move || run(seed));
+        }
+    });
+}
+
+#[test]
+fn damaged_items_end_as_both_readers_agree() {
+    // The hash is made right for what comes out, so that nothing but the items decides.
+    let header = slices_header();
+    let mut coded = Coded::new(&header);
+    stream::apply_changes(&slices_content(), &mut coded.mirror).unwrap();
+    let mut part = |open: bool, base: u8| {
+        let all = [(0, [0, 1, 3]), (2, [0, 4, 1])].map(|(index, opens)| {
+            let opens = open.then_some(opens);
+            let target = |at: usize| base.wrapping_add((at * 13) as u8);
+            (index, opens, coded.code(index, opens, 3, &target))
+        });
+        items(&all)
+    };
+    let parts = [part(true, 100), part(false, 90), part(false, 160)];
+    let mut random = Random(6);
+    let mut shown = 0;
+    for _ in 0..30_000 {
+        let mut parts = parts.clone();
+        let which = random.below(3);
+        damage(&mut parts[which], &mut random);
+        shown += usize::from(slices_outcome(&header, &parts).error.is_none());
+    }
+    assert!((300..29_000).contains(&shown), "{shown} shown");
+}
+
 // ---------------------------------------------------------------- memory
 
-/// What a client may hold at most: its mirror, one packet and one content, and zstd's own state.
+/// What a client may hold at most: its mirror, what it keeps of slices, one packet and one content,
+/// and zstd's own state.
 fn most_bytes(room: Capacity) -> u64 {
     let packet = PACKET_HEADER_BYTES as u64 + u64::from(MAX_BODY_BYTES);
-    room.bytes() + packet + u64::from(MAX_RAW_BYTES) + (256 << 10)
+    room.bytes() + u64::from(room.cells) * 65 + packet + u64::from(MAX_RAW_BYTES) + (256 << 10)
 }
 
 #[test]
@@ -1045,8 +1731,23 @@ fn no_length_field_takes_memory_beyond_what_the_client_allowed() {
         );
         assert!(memory < 256 << 10, "{memory} bytes");
     }
+    // More slices and points than cells can hold, which nobody has room for [4.1].
+    for (slices, points) in [(10, 0), (u32::MAX, 0), (0, 64), (0, u32::MAX)] {
+        let header = Header {
+            slices,
+            points,
+            ..slices_header()
+        };
+        let (memory, result) = push(&Hand::with(&header).bytes);
+        assert_eq!(result, Err(StreamError::Value.into()));
+        assert!(memory < 256 << 10, "{memory} bytes");
+    }
     // The largest limits that a header may ask for.
     let header = Header {
+        profile: Profile::Residual,
+        step: 255,
+        slices: 9,
+        points: 63,
         max_body_bytes: MAX_BODY_BYTES,
         max_raw_bytes: MAX_RAW_BYTES,
         ..Hand::header()
@@ -1544,7 +2245,7 @@ fn a_hundred_thousand_damaged_messages_are_read_or_refused() {
 #[test]
 fn a_world_driven_to_absurd_places_goes_on() {
     // All of these are finite, and so get through the uplink.
-    let mut world = world(24.0);
+    let mut world = world(24.0, CELLS);
     let mut encoder = Encoder::new(&world, CELLS);
     let mut bytes = encoder.header(&world, 0, 30.0);
     let mut client = Client::new(config(capacity_of(&world.truth)));

@@ -12,7 +12,8 @@ use psao_core::stream::{
 /// What a client may use at most.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Config {
-    /// Largest mirror; a stream that needs more is refused before memory is taken.
+    /// Largest mirror; a stream that needs more is refused before memory is taken. Profile
+    /// `residual` takes at most 65 bytes a cell besides, for the codec's state.
     pub capacity: Capacity,
     /// Hash of the client's scene; 0 accepts any.
     pub scene_hash: u64,
@@ -330,6 +331,7 @@ impl Client {
             self.mirror = Mirror::new(Heap::new(Capacity::default()));
             self.mirror = Mirror::new(Heap::new(need));
         }
+        self.slices = SliceHeap::default();
         self.slices = SliceHeap::new(header.slices, header.points);
         self.raw.resize(header.max_raw_bytes as usize, 0);
         self.header = Some(header);

@@ -137,13 +137,13 @@ fn turned(squared: u32, p: u8, q: u8) -> u32 {
     // 0 where they face the same way, about 500 where opposite.
     let turned = (127i32.wrapping_mul(127).wrapping_sub(dot).max(0) as u32) >> 6;
     let more = u64::from(squared).wrapping_mul(u64::from(turned)) >> 5;
-    (turned << 1).saturating_add(more as u32)
+    (turned << 1).saturating_add(u32::try_from(more).unwrap_or(u32::MAX))
 }
 
-/// Keeps a candidate if it is among the nearest.
+/// Keeps a candidate if it is among the nearest; of equally near ones, the nearest in the order.
 fn keep(nearest: &mut [(u32, u8); NEIGHBOURS], mut candidate: (u32, u8)) {
     for kept in nearest {
-        if candidate.0 < kept.0 {
+        if candidate < *kept {
             core::mem::swap(kept, &mut candidate);
         }
     }

@@ -96,8 +96,12 @@ fn points(cells: &[Cell]) -> impl Iterator<Item = crate::Point> + '_ {
 impl Slices<'_> {
     /// Opens a slice: its points are those that the mirror's cells hold now.
     ///
+    /// A cell without points is refused, and so the work that a slice can ask for is bounded by
+    /// its points.
+    ///
     /// # Errors
-    /// It is open already, or empty; its cells or points are more than there is room for.
+    /// It is open already, or has no cell; a cell has no point; its instance has none; there are
+    /// more points than a slice or the side data has room for.
     pub fn open<M: Memory>(
         &mut self,
         mirror: &Mirror<M>,
@@ -110,6 +114,7 @@ impl Slices<'_> {
         let grid = mirror
             .instances()
             .get(instance as usize)
+            .filter(|grid| grid.bucket_count > 0)
             .ok_or(StreamError::Value)?;
         let slice = self
             .slices
@@ -121,9 +126,13 @@ impl Slices<'_> {
         let mut positions = [[0u32; 3]; SLICE_POINTS];
         let mut normals = [0u8; SLICE_POINTS];
         let mut count = 0usize;
-        let row = grid.dims[0].max(1);
+        let row = grid.dims[0];
+        // A grid of 2³² cells and more wraps, as its keys do.
         let layer = row.wrapping_mul(grid.dims[1]).max(1);
         for cell in cells {
+            if cell.is_empty() {
+                return Err(StreamError::Value);
+            }
             let (z, rest) = (div(cell.key, layer), rem(cell.key, layer));
             let corner = [rem(rest, row), div(rest, row), z];
             for point in points(core::slice::from_ref(cell)) {

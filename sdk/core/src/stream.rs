@@ -106,9 +106,10 @@ impl core::fmt::Display for StreamError {
             ),
             StreamError::Profile(profile) => write!(
                 f,
-                "stream profile {profile}, this reader knows {}: \
-                 let the server use that one, or update the SDK",
-                Profile::Cells as u8
+                "stream profile {profile}, this reader knows {} (cells) and {} (residual): \
+                 let the server use one of these, or update the SDK",
+                Profile::Cells as u8,
+                Profile::Residual as u8
             ),
             StreamError::Checksum => f.write_str("a packet's checksum does not match"),
             StreamError::Sequence => f.write_str("a packet is missing or out of order"),
