@@ -386,7 +386,8 @@ fn apply_items(
         for (cell, place) in &slice.places {
             occlusion.push(i64::from(mirror[2][cell][4 + 4 * place]));
         }
-        decode(data, opens, i64::from(header.step), &mut occlusion, slice)?;
+        let step = if opens { 1 } else { i64::from(header.step) };
+        decode(data, opens, step, &mut occlusion, slice)?;
         for ((cell, place), value) in slice.places.iter().zip(occlusion) {
             let bytes = mirror[2].get_mut(cell).expect("its point was just read");
             bytes[4 + 4 * place] = value as u8;
