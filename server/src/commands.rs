@@ -455,7 +455,7 @@ pub fn inspect(args: &InspectArgs, out: &mut dyn Write) -> Result<(), String> {
                     "frame      time s  packets     bytes  mirror hash".into(),
                 )?;
             }
-            kind::FRAME => {
+            kind::FRAME | kind::SLICES => {
                 let (frame, _) = Frame::read(packet.body).map_err(|error| fail(rest, &error))?;
                 packets += 1;
                 frame_bytes += length;
