@@ -249,7 +249,7 @@ fn compare(
             DVec3::new(axis(), axis(), axis()) * size
         };
         let (mut low, mut high) = (exact, exact);
-        for _ in 0..400 {
+        for _ in 0..20_000 {
             let position = position + vector(f.ulp);
             let normal = normal + vector(DVec3::splat(f64::from(f32::EPSILON)));
             let near = reference(lookup, kernel, f.instance, position, normal);
