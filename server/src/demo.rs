@@ -456,9 +456,11 @@ fn median(mut values: Vec<f64>) -> f64 {
 impl Figures {
     fn summarise(&mut self, rows: &[FrameRow], shots: &[Shot]) {
         let later = &rows[1.min(rows.len() - 1)..];
-        let bits = later.iter().map(|row| row.bytes as f64 * 8.0).sum::<f64>();
+        // The first frame alone says nothing about a rate.
+        let rated = &rows[1..];
+        let bits = rated.iter().map(|row| row.bytes as f64 * 8.0).sum::<f64>();
         self.first_frame_bytes = rows[0].bytes;
-        self.mbit_per_s = bits / later.len() as f64 * f64::from(self.fps) / 1e6;
+        self.mbit_per_s = bits / rated.len().max(1) as f64 * f64::from(self.fps) / 1e6;
         self.rays_traced = rows.iter().map(|row| row.rays).sum();
         self.rays_if_all_traced = rows.iter().map(|row| row.rays_if_all).sum();
         let squares = rows
