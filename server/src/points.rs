@@ -7,9 +7,9 @@
 
 mod eliminate;
 
-use crate::scene::{Mask, Mesh, Wrap};
+use crate::scene::Mesh;
 use eliminate::{Sample, eliminate};
-use glam::{DVec3, Vec2, Vec3};
+use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 use std::fmt;
 
@@ -303,7 +303,7 @@ fn strew(mesh: &Mesh, areas: &Areas, sides: u32, per_side: u32, seed: u64) -> Ve
         mask.is_some_and(|mask| {
             let [t0, t1, t2] =
                 mesh.triangles[point.triangle as usize].map(|i| mesh.uvs[i as usize]);
-            is_hole(mask, t0 + point.u * (t1 - t0) + point.v * (t2 - t0))
+            mask.is_hole(t0 + point.u * (t1 - t0) + point.v * (t2 - t0))
         })
     };
     let count = per_side * sides;
@@ -324,29 +324,6 @@ fn scramble(mut x: u64) -> u64 {
     x = (x ^ (x >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
     x = (x ^ (x >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
     x ^ (x >> 31)
-}
-
-/// The nearest texel is below the cutoff.
-fn is_hole(mask: &Mask, uv: Vec2) -> bool {
-    let texel = |x: f32, size: u32, wrap: Wrap| {
-        let size = i64::from(size);
-        let at = (f64::from(x) * size as f64).floor() as i64;
-        match wrap {
-            Wrap::Clamp => at.clamp(0, size - 1),
-            Wrap::Repeat => at.rem_euclid(size),
-            Wrap::Mirror => {
-                let at = at.rem_euclid(2 * size);
-                at.min(2 * size - 1 - at)
-            }
-        }
-    };
-    if mask.width == 0 || mask.height == 0 {
-        return false;
-    }
-    let x = texel(uv.x, mask.width, mask.wrap[0]);
-    let y = texel(uv.y, mask.height, mask.wrap[1]);
-    let alpha = mask.alpha.get((y * i64::from(mask.width) + x) as usize);
-    alpha.is_some_and(|&alpha| f32::from(alpha) / 255.0 < mask.cutoff)
 }
 
 /// Candidates as elimination needs them.
@@ -409,6 +386,8 @@ fn spread(mut x: u64) -> u64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::scene::{Mask, Wrap};
+    use glam::Vec2;
     use rayon::ThreadPoolBuilder;
 
     fn plane(side: f32) -> Mesh {

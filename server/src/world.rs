@@ -777,20 +777,6 @@ impl World {
         &self.occlusion[slice.points.start as usize..slice.points.end as usize]
     }
 
-    /// Positions and unit normals of a slice's points in their mesh's rest space, in their order:
-    /// what never changes, however the instance moves and bends.
-    pub fn rest_points(&self, slice: &Slice) -> impl Iterator<Item = (Vec3, Vec3)> {
-        let mesh = self.mesh(slice.instance);
-        self.points[slice.points.start as usize..slice.points.end as usize]
-            .iter()
-            .map(|point| {
-                (
-                    point.position(&mesh.triangles, &mesh.positions),
-                    point.normal(&mesh.triangles, &mesh.positions, &mesh.normals),
-                )
-            })
-    }
-
     /// Points, discarded ones included.
     pub fn point_count(&self) -> usize {
         self.points.len()
