@@ -3,7 +3,7 @@
 use crate::memory::{Heap, SliceHeap};
 use psao_core::Mirror;
 use psao_core::mirror::Capacity;
-use psao_core::slices::apply_slices;
+use psao_core::slices::{apply_instances, apply_patches, apply_slices};
 use psao_core::stream::{
     CHANGES_HEADER_BYTES, FRAME_HEADER_BYTES, Frame, Header, MAX_BODY_BYTES, PACKET_HEADER_BYTES,
     PREAMBLE, Packet, Profile, Reader, Refusal, StreamError, apply_changes, flag, kind,
@@ -12,8 +12,7 @@ use psao_core::stream::{
 /// What a client may use at most.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Config {
-    /// Largest mirror; a stream that needs more is refused before memory is taken. Profile
-    /// `residual` takes at most 65 bytes a cell besides, for the codec's state.
+    /// Most room of each kind; a stream that needs more is refused before memory is taken.
     pub capacity: Capacity,
     /// Hash of the client's scene; 0 accepts any.
     pub scene_hash: u64,
@@ -48,8 +47,15 @@ impl std::fmt::Display for ClientError {
             ClientError::Stream(error) => write!(f, "{error}"),
             ClientError::Capacity(needed) => write!(
                 f,
-                "the scene needs {} instances, {} buckets and {} cells: raise Config::capacity",
-                needed.instances, needed.buckets, needed.cells
+                "the scene needs {} instances, {} buckets, {} cells, {} slices, {} points, \
+                 {} patches and {} bytes of topology: raise Config::capacity",
+                needed.instances,
+                needed.buckets,
+                needed.cells,
+                needed.slices,
+                needed.points,
+                needed.patches,
+                needed.topology_bytes
             ),
             ClientError::Scene(hash) => write!(
                 f,
@@ -106,8 +112,10 @@ pub struct Stats {
     pub buckets: u64,
     /// Cells set.
     pub cells: u64,
-    /// Slices decoded (profile `residual`).
+    /// Items of slices applied (profile `residual`).
     pub slices: u64,
+    /// Patches that came (profile `residual`).
+    pub patches: u64,
 }
 
 /// Follows one stream. Memory is taken when the header comes, and never after.
@@ -117,6 +125,10 @@ pub struct Client {
     header: Option<Header>,
     mirror: Mirror<Heap>,
     slices: SliceHeap,
+    /// What mirror and slices have room for.
+    room: Capacity,
+    /// Of the patches that have come.
+    topology_hash: u64,
     /// Bytes of a packet that is not whole yet.
     input: Vec<u8>,
     /// Decompressed content of a packet.
@@ -142,6 +154,8 @@ impl Client {
             header: None,
             mirror: Mirror::new(Heap::new(Capacity::default())),
             slices: SliceHeap::default(),
+            room: Capacity::default(),
+            topology_hash: 0,
             input: Vec::new(),
             raw: Vec::new(),
             zstd: zstd::zstd_safe::DCtx::create(),
@@ -285,7 +299,7 @@ impl Client {
         self.next_sequence = packet.sequence.wrapping_add(1);
         match packet.kind {
             kind::FRAME | kind::SLICES => packet.check_flags(flag::SNAPSHOT | flag::LAST)?,
-            kind::HEADER | kind::END | kind::REFUSE => packet.check_flags(0)?,
+            kind::HEADER | kind::END | kind::REFUSE | kind::PATCHES => packet.check_flags(0)?,
             _ => {}
         }
         match (packet.kind, self.header) {
@@ -293,6 +307,11 @@ impl Client {
             (kind::FRAME, Some(header)) => self.frame(&header, packet),
             (kind::SLICES, Some(header)) if header.profile == Profile::Residual => {
                 self.frame(&header, packet)
+            }
+            (kind::PATCHES, Some(header)) if header.profile == Profile::Residual => {
+                let count = apply_patches(packet.body, &mut self.slices.slices())?;
+                self.stats.patches += u64::from(count);
+                Ok(None)
             }
             (kind::END, Some(_)) if self.open_frame.is_none() => {
                 if !packet.body.is_empty() {
@@ -308,9 +327,7 @@ impl Client {
                 let printable = text.chars().filter(|c| !c.is_control());
                 Err(ClientError::Refused(refusal, printable.take(200).collect()))
             }
-            (kind::HEADER | kind::FRAME | kind::END | kind::REFUSE | kind::SLICES, _) => {
-                Err(StreamError::Order.into())
-            }
+            (kind::HEADER..=kind::PATCHES, _) => Err(StreamError::Order.into()),
             (_, None) => Err(StreamError::Order.into()),
             _ if packet.flags & flag::OPTIONAL != 0 => Ok(None),
             (other, _) => Err(StreamError::Kind(other).into()),
@@ -318,21 +335,27 @@ impl Client {
     }
 
     fn begin(&mut self, header: Header) -> Result<(), ClientError> {
-        let (need, have) = (header.capacity, self.config.capacity);
-        if need.instances > have.instances || need.buckets > have.buckets || need.cells > have.cells
-        {
+        let need = header.capacity;
+        if !self.config.capacity.holds(&need) {
             return Err(ClientError::Capacity(need));
         }
         if self.config.scene_hash != 0 && self.config.scene_hash != header.scene_hash {
             return Err(ClientError::Scene(header.scene_hash));
         }
-        if self.mirror.capacity() != need {
-            // The old one goes first, so that both are never held at once.
+        // What is replaced goes first, so that old and new are never held at once.
+        if self.room != need {
             self.mirror = Mirror::new(Heap::new(Capacity::default()));
+            self.slices = SliceHeap::default();
             self.mirror = Mirror::new(Heap::new(need));
+            self.slices = SliceHeap::new(need);
+            self.room = need;
+        } else {
+            self.slices.slices().reset(need.cells);
+            if header.topology_hash == 0 || header.topology_hash != self.topology_hash {
+                self.slices.slices().forget_patches();
+            }
         }
-        self.slices = SliceHeap::default();
-        self.slices = SliceHeap::new(header.slices, header.points);
+        self.topology_hash = header.topology_hash;
         self.raw.resize(header.max_raw_bytes as usize, 0);
         self.header = Some(header);
         self.input.reserve_exact(self.packet_bytes());
@@ -362,7 +385,7 @@ impl Client {
         self.open_frame = (!last).then_some((frame.id, frame.time_ns));
         if snapshot {
             self.mirror.reset();
-            self.slices.slices().reset();
+            self.slices.slices().reset(header.capacity.cells);
             self.in_snapshot = true;
         } else if self.state == State::Desynchronised && !self.in_snapshot {
             return Ok(None);
@@ -388,7 +411,14 @@ impl Client {
             if written != raw_bytes {
                 return Err(ClientError::Compression);
             }
-            let changes = apply_changes(&self.raw[..raw_bytes], &mut self.mirror)?;
+            let raw = &self.raw[..raw_bytes];
+            let changes = match header.profile {
+                Profile::Cells => apply_changes(raw, &mut self.mirror)?,
+                Profile::Residual => {
+                    let slices = self.slices.slices();
+                    apply_instances(raw, &mut self.mirror, &slices)?
+                }
+            };
             self.stats.instances += u64::from(changes.instances);
             self.stats.buckets += u64::from(changes.buckets);
             self.stats.cells += u64::from(changes.cells);
@@ -425,6 +455,22 @@ impl Client {
     /// of the next).
     pub fn mirror(&self) -> &Mirror<Heap> {
         &self.mirror
+    }
+
+    /// What profile `residual` keeps beside the mirror.
+    pub fn slices(&self) -> &SliceHeap {
+        &self.slices
+    }
+
+    /// What to say in a hello ([`psao_core::uplink::Hello::topology_hash`]) so that no patch is
+    /// sent again: the hash of the patches that this client has got, in an earlier stream or from
+    /// a recording, if it has all of them; else 0.
+    pub fn topology_hash(&self) -> u64 {
+        if self.slices.has_all_patches() {
+            self.topology_hash
+        } else {
+            0
+        }
     }
 
     /// What changed has been uploaded.

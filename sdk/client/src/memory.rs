@@ -1,9 +1,11 @@
 //! Heap memory for a mirror, taken once.
 
+use psao_core::bins::{NOWHERE, Place};
 use psao_core::mirror::{Capacity, Memory, Parts, PartsMut};
 use psao_core::residual::Neighbours;
-use psao_core::slices::{Slice, Slices};
-use psao_core::{Bucket, Cell, Instance};
+use psao_core::slices::{Patch, Slice, Slices};
+use psao_core::topology::{PATCH_POINTS, PatchPoint};
+use psao_core::{Bucket, Cell, Instance, dirty};
 
 /// A mirror's buffers on the heap; never grows.
 #[derive(Clone, Debug, Default)]
@@ -58,46 +60,110 @@ impl Memory for Heap {
     }
 }
 
-/// What the residual codec keeps beside a mirror; never grows.
+/// What profile `residual` keeps beside a mirror; never grows.
 #[derive(Clone, Debug, Default)]
 pub struct SliceHeap {
     slices: Vec<Slice>,
-    neighbours: Vec<Neighbours>,
+    patches: Vec<Patch>,
+    topology: Vec<u8>,
+    topology_used: u32,
+    values: Vec<u8>,
     last: Vec<i8>,
-    points_used: u32,
+    neighbours: Vec<Neighbours>,
+    places: Vec<Place>,
+    free: Vec<u64>,
+    scratch: Vec<PatchPoint>,
+    scratch_of: [u32; 3],
 }
 
 impl SliceHeap {
-    /// Room for slices and their points, none of them open.
-    pub fn new(slices: u32, points: u32) -> SliceHeap {
-        SliceHeap {
-            slices: vec![Slice::default(); slices as usize],
-            neighbours: vec![Neighbours::default(); points as usize],
-            last: vec![0; points as usize],
-            points_used: 0,
-        }
+    /// Room as a header asks for: no patch has come, no slice is open.
+    pub fn new(capacity: Capacity) -> SliceHeap {
+        let points = capacity.points as usize;
+        let mut heap = SliceHeap {
+            slices: vec![Slice::default(); capacity.slices as usize],
+            patches: vec![Patch::default(); capacity.patches as usize],
+            topology: vec![0; capacity.topology_bytes as usize],
+            topology_used: 0,
+            values: vec![0; points],
+            last: vec![0; points],
+            neighbours: vec![Neighbours::default(); points],
+            places: vec![NOWHERE; points],
+            free: vec![0; dirty::words(capacity.cells as usize)],
+            scratch: vec![PatchPoint::default(); PATCH_POINTS],
+            scratch_of: [0; 3],
+        };
+        heap.slices().reset(capacity.cells);
+        heap
     }
 
     /// Lends it to the codec.
     pub fn slices(&mut self) -> Slices<'_> {
         let SliceHeap {
             slices,
-            neighbours,
+            patches,
+            topology,
+            topology_used,
+            values,
             last,
-            points_used,
+            neighbours,
+            places,
+            free,
+            scratch,
+            scratch_of,
         } = self;
         Slices {
             slices,
-            neighbours,
+            patches,
+            topology,
+            topology_used,
+            values,
             last,
-            points_used,
+            neighbours,
+            places,
+            free,
+            scratch,
+            scratch_of,
         }
+    }
+
+    /// All slices, open or not.
+    pub fn get(&self) -> &[Slice] {
+        &self.slices
+    }
+
+    /// An open slice's occlusion, a point: 255 is open.
+    pub fn values(&self, slice: &Slice) -> &[u8] {
+        let first = slice.point_first as usize;
+        &self.values[first..first + slice.point_count as usize]
+    }
+
+    /// An open slice's last changes, a point.
+    pub fn last(&self, slice: &Slice) -> &[i8] {
+        let first = slice.point_first as usize;
+        &self.last[first..first + slice.point_count as usize]
+    }
+
+    /// An open slice's neighbours, a point.
+    pub fn neighbours(&self, slice: &Slice) -> &[Neighbours] {
+        let first = slice.point_first as usize;
+        &self.neighbours[first..first + slice.point_count as usize]
+    }
+
+    /// Whether all patches have come.
+    pub fn has_all_patches(&self) -> bool {
+        self.patches.iter().all(|patch| patch.bytes != 0)
     }
 
     /// Bytes held.
     pub fn bytes(&self) -> u64 {
-        let slices = self.slices.len() * size_of::<Slice>();
-        let points = self.last.len() * (size_of::<Neighbours>() + 1);
-        (slices + points) as u64
+        let a_point = 1 + 1 + size_of::<Neighbours>() + size_of::<Place>();
+        let bytes = self.slices.len() * size_of::<Slice>()
+            + self.patches.len() * size_of::<Patch>()
+            + self.topology.len()
+            + self.values.len() * a_point
+            + self.free.len() * 8
+            + self.scratch.len() * size_of::<PatchPoint>();
+        bytes as u64
     }
 }
