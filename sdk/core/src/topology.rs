@@ -607,3 +607,131 @@ fn code_across<S: Side>(
     let inside = value.filter(|value| (low..=high).contains(value));
     inside.ok_or(StreamError::Value)
 }
+
+#[cfg(test)]
+#[allow(
+    clippy::indexing_slicing,
+    clippy::unwrap_used,
+    clippy::arithmetic_side_effects
+)]
+mod tests {
+    extern crate std;
+    use super::*;
+    use std::vec;
+    use std::vec::Vec;
+
+    struct Random(u32);
+
+    impl Random {
+        fn below(&mut self, limit: u32) -> u32 {
+            self.0 = self.0.wrapping_mul(747796405).wrapping_add(2891336453);
+            let mixed = (self.0 >> 16 ^ self.0).wrapping_mul(0x7feb352d);
+            (mixed ^ mixed >> 15) % limit
+        }
+    }
+
+    fn sorted(mut points: Vec<PatchPoint>) -> Vec<PatchPoint> {
+        let order = Order::of(&points);
+        points.sort_by_key(|point| order.key(point));
+        points
+    }
+
+    /// Points all over a box, or on a slope in it, or all in one place.
+    fn points(random: &mut Random, count: usize) -> Vec<PatchPoint> {
+        let kind = random.below(4);
+        let extent = 1 << random.below(POSITION_BITS + 1);
+        let from = [0; 3].map(|_| random.below((1 << POSITION_BITS) - extent + 1));
+        let normals = 1 + random.below(225);
+        let point = |random: &mut Random| {
+            let [u, v, w] = [0; 3].map(|_| random.below(extent));
+            let by = match kind {
+                0 => [u, v, w],
+                1 => [u, v, (u + v) / 2],
+                2 => [u, extent / 2, v],
+                _ => [extent - 1; 3],
+            };
+            let normal = random.below(normals) as u8;
+            PatchPoint {
+                position: [from[0] + by[0], from[1] + by[1], from[2] + by[2]],
+                normal: normal_code([normal % 15, normal / 15]),
+                level: random.below(LEVELS) as u8,
+                reserved: [0; 2],
+            }
+        };
+        (0..count).map(|_| point(random)).collect()
+    }
+
+    #[test]
+    fn patches_are_read_as_they_were_written() {
+        let mut random = Random(3);
+        let mut bytes = vec![0; MAX_PATCH_BYTES];
+        for case in 0..400 {
+            let count = [1, 2, 17, 300, PATCH_POINTS][case % 5];
+            let points = sorted(points(&mut random, count));
+            let length = encode_patch(&points, &mut bytes).unwrap();
+            let mut read = vec![PatchPoint::default(); PATCH_POINTS];
+            assert_eq!(
+                decode_patch(&bytes[..length], &mut read),
+                Ok(count),
+                "case {case}"
+            );
+            assert_eq!(read[..count], points, "case {case}");
+        }
+    }
+
+    #[test]
+    fn what_is_no_patch_is_refused_by_writer_and_reader() {
+        let mut random = Random(4);
+        let mut bytes = vec![0; MAX_PATCH_BYTES];
+        let mut good = sorted(points(&mut random, 300));
+        let length = encode_patch(&good, &mut bytes).unwrap();
+        let bytes = &bytes[..length];
+        let mut read = vec![PatchPoint::default(); PATCH_POINTS];
+        // Damage may leave another patch: checksum and hash are for that.
+        let cut = (0..length).filter(|&end| decode_patch(&bytes[..end], &mut read).is_ok());
+        assert!(cut.count() < 4);
+        assert!(decode_patch(bytes, &mut read[..299]).is_err());
+        let mut wrong = 0;
+        for at in 0..length * 8 {
+            let mut bytes = bytes.to_vec();
+            bytes[at / 8] ^= 1 << (at % 8);
+            wrong += usize::from(decode_patch(&bytes, &mut read) != Ok(300));
+        }
+        assert!(wrong * 2 > length * 8, "{wrong} of {} noticed", length * 8);
+        let mut refused = |points: &[PatchPoint]| {
+            assert_eq!(
+                encode_patch(points, &mut vec![0; MAX_PATCH_BYTES]),
+                Err(Full)
+            );
+        };
+        refused(&[]);
+        refused(&vec![good[0]; PATCH_POINTS + 1]);
+        good.reverse();
+        refused(&good);
+        for spoil in [
+            |point: &mut PatchPoint| point.level = LEVELS as u8,
+            |point: &mut PatchPoint| point.normal = 0xf7,
+            |point: &mut PatchPoint| point.position[1] = 1 << POSITION_BITS,
+        ] {
+            let mut point = good[0];
+            spoil(&mut point);
+            refused(&[point]);
+        }
+        assert_eq!(encode_patch(&good[..1], &mut []), Err(Full));
+    }
+
+    #[test]
+    fn patches_are_the_same_on_every_machine() {
+        let mut random = Random(6);
+        let mut bytes = vec![0; MAX_PATCH_BYTES];
+        let mut hash = 0xcbf2_9ce4_8422_2325u64;
+        for case in 0..60 {
+            let points = sorted(points(&mut random, [1, 50, 700][case % 3]));
+            let length = encode_patch(&points, &mut bytes).unwrap();
+            for byte in &bytes[..length] {
+                hash = (hash ^ u64::from(*byte)).wrapping_mul(0x100_0000_01b3);
+            }
+        }
+        assert_eq!(hash, 3568205155712585590);
+    }
+}

@@ -4,6 +4,7 @@ use super::{Compression, FrameStats, View, capacity_of, compress, compressor, wr
 use crate::world::{Slice, World};
 use glam::Vec3;
 use psao::memory::{Heap, SliceHeap};
+use psao_core::bins::Bin;
 use psao_core::mirror::Capacity;
 use psao_core::residual::{MAX_SLICE_BYTES, Quantiser, SliceState, encode_slice};
 use psao_core::slices::{self, FIRST, ITEM_HEADER_BYTES, Item, Operation};
@@ -11,7 +12,7 @@ use psao_core::stream::{CHANGES_HEADER_BYTES, Writer, kind};
 use psao_core::topology::LEVELS;
 use psao_core::{Instance, Mirror};
 use rayon::prelude::*;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashSet};
 use std::ops::Range;
 
 /// What a client gets at most.
@@ -129,6 +130,21 @@ impl Residual {
             space: Space::new(capacity.points),
             debt: 0.0,
         }
+    }
+
+    /// Cells that the client has, and that it would have if nothing were left out for being open.
+    pub fn cells(&self, world: &World) -> [usize; 2] {
+        let has = self.mirror.cells().iter().filter(|cell| !cell.is_empty());
+        let mut all = HashSet::new();
+        for (slice, open) in world.slices.iter().zip(self.heap.get()) {
+            if open.point_count > 0 {
+                let grid = self.mirror.instances()[slice.instance as usize];
+                let points = world.topology.points_of(slice.patch, grid.level);
+                let bins = points.filter_map(|point| Bin::of(&grid, point));
+                all.extend(bins.map(|bin| (slice.instance, bin.cell)));
+            }
+        }
+        [has.count(), all.len()]
     }
 
     pub fn capacity(&self) -> Capacity {
