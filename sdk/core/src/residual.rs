@@ -66,8 +66,6 @@ pub fn find_neighbours(points: &[PatchPoint], first: bool, out: &mut [Neighbours
         }
     }
     let [xs, ys, zs] = &axes;
-    // The nearest so far, near ones first: distance in space and in the order.
-    const NONE: [(u32, u8); NEIGHBOURS] = [(u32::MAX, 0); NEIGHBOURS];
     let mut later = [NONE; SLICE_POINTS];
     // How near one has to be to be among them.
     let mut later_wanted = [if first { 0 } else { i32::MAX }; SLICE_POINTS];
@@ -110,34 +108,42 @@ pub fn find_neighbours(points: &[PatchPoint], first: bool, out: &mut [Neighbours
             }
             let squared = *square as u32;
             let apart = squared.saturating_add(turned(squared, point.normal, other.normal));
-            keep(&mut earlier, (apart, back));
+            let candidate = u64::from(apart) << 8 | u64::from(back);
+            keep(&mut earlier, candidate);
             earlier_wanted = farthest(&earlier);
             if !first {
-                keep(other_later, (apart, back));
+                keep(other_later, candidate);
                 *other_wanted = farthest(other_later);
             }
         }
         if let Some(out) = out.get_mut(at) {
-            out.earlier = earlier.map(|(_, back)| back);
+            out.earlier = earlier.map(|candidate| candidate as u8);
         }
     }
     for (out, later) in out.iter_mut().zip(&later).take(count) {
-        out.later = later.map(|(_, forward)| forward);
+        out.later = later.map(|candidate| candidate as u8);
     }
 }
 
 /// Coordinates that differ by more count as differing by this.
 const FAR: i32 = 1 << 14;
 
-/// Any distance that a nearer one must be below.
-fn farthest(nearest: &[(u32, u8); NEIGHBOURS]) -> i32 {
-    let [.., (farthest, _)] = nearest;
-    i32::try_from(*farthest).unwrap_or(i32::MAX)
+/// The nearest so far, near ones first: the distance in space, then, in the lowest byte, in the
+/// order.
+const NONE: [u64; NEIGHBOURS] = [(u32::MAX as u64) << 8; NEIGHBOURS];
+
+/// A distance that a nearer one must be below.
+fn farthest(nearest: &[u64; NEIGHBOURS]) -> i32 {
+    let [.., farthest] = nearest;
+    i32::try_from(farthest >> 8).unwrap_or(i32::MAX)
 }
 
 /// How much farther apart two points count because they face different ways: what is on the other
 /// side of an edge or a wall says little.
 fn turned(squared: u32, p: u8, q: u8) -> u32 {
+    if p == q {
+        return 0;
+    }
     let normal = |code: u8| {
         NORMAL_STEPS
             .get(usize::from(code))
@@ -156,11 +162,9 @@ fn turned(squared: u32, p: u8, q: u8) -> u32 {
 }
 
 /// Keeps a candidate if it is among the nearest; of equally near ones, the nearest in the order.
-fn keep(nearest: &mut [(u32, u8); NEIGHBOURS], mut candidate: (u32, u8)) {
+fn keep(nearest: &mut [u64; NEIGHBOURS], mut candidate: u64) {
     for kept in nearest {
-        if candidate < *kept {
-            core::mem::swap(kept, &mut candidate);
-        }
+        (*kept, candidate) = ((*kept).min(candidate), (*kept).max(candidate));
     }
 }
 
