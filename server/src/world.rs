@@ -6,8 +6,10 @@
 //! others again only when something moved within their reach.
 
 use crate::points::{PointError, SurfacePoint, generate, largest_radius, morton_order};
-use crate::rays::{Against, CpuTracer, Deformed, TooManyTriangles, Tracer, offset_origin, reach};
-use crate::samples::{PointSamples, Samples};
+use crate::rays::{
+    Against, CpuTracer, Deformed, Fan, TooManyTriangles, Tracer, offset_origin, reach,
+};
+use crate::samples::Samples;
 use crate::scene::{InstancePose, Mesh, Pose, Scene};
 use crate::truth::{Place, Placement, Truth, buckets_for, choose_buckets, fit};
 use glam::{Affine3A, DAffine3, Vec3, Vec3A};
@@ -660,7 +662,7 @@ impl World {
         let movers = self.movers_near(slice.bounds);
         let words = self.words();
         let mut traced = Traced::default();
-        let mut directions = vec![Vec3::ZERO; rays];
+        let mut known = vec![0u64; words];
         let mut todo = vec![0u64; words];
         let mut hit = vec![0u64; words];
         let attached_hits = |number: u32| {
@@ -683,16 +685,16 @@ impl World {
             }
             let tangent = point.tangent(triangles, positions);
             let tangent = pose.world_from_local.transform_vector3(tangent);
-            let samples = self.samples.of_point(number, normal, tangent);
+            let fan = self.samples.fan(number, origin, normal, tangent);
             traced.points += 1;
             hit.fill(0);
             if let Some(attached) = attached {
                 hit.copy_from_slice(attached_hits(number));
                 if converging {
-                    set_bits(&mut todo, slice.rays_done..rays);
-                    traced.rays += take(&samples, &todo, &hit, &mut directions);
+                    fan.directions.mark_given(slice.rays_done..rays, &mut todo);
+                    traced.rays += take(&todo, &hit);
                     self.tracer
-                        .occluded(attached, origin, &directions, t_max, &todo, &mut hit);
+                        .occluded_fan(attached, &fan, t_max, &todo, &mut hit);
                     traced.fixed.extend_from_slice(&hit);
                 }
             }
@@ -702,14 +704,18 @@ impl World {
                 if others == Against::Movers {
                     todo.fill(0);
                     for mover in movers.iter().filter(reached) {
-                        mark_towards(*mover, origin, &samples, rays, &mut todo);
+                        mark_towards(*mover, &fan, &mut todo);
+                    }
+                    if rays < self.options.rays {
+                        fan.directions.mark_given(0..rays, &mut known);
+                        todo.iter_mut().zip(&known).for_each(|(t, k)| *t &= k);
                     }
                 } else {
-                    set_bits(&mut todo, 0..rays);
+                    fan.directions.mark_given(0..rays, &mut todo);
                 }
-                traced.rays += take(&samples, &todo, &hit, &mut directions);
+                traced.rays += take(&todo, &hit);
                 self.tracer
-                    .occluded(others, origin, &directions, t_max, &todo, &mut hit);
+                    .occluded_fan(others, &fan, t_max, &todo, &mut hit);
             }
             traced.push(&hit, rays);
         }
@@ -862,45 +868,23 @@ impl Traced {
     }
 }
 
-/// Makes the directions that are asked for and not known to hit, and counts them.
-fn take(samples: &PointSamples, todo: &[u64], hit: &[u64], directions: &mut [Vec3]) -> u64 {
-    let mut rays = 0;
-    for (word, (todo, hit)) in todo.iter().zip(hit).enumerate() {
-        let mut rest = todo & !hit;
-        rays += u64::from(rest.count_ones());
-        while rest != 0 {
-            let index = word * 64 + rest.trailing_zeros() as usize;
-            directions[index] = samples.direction(index);
-            rest &= rest - 1;
-        }
-    }
-    rays
+/// Rays that are asked for and not known to hit.
+fn take(todo: &[u64], hit: &[u64]) -> u64 {
+    let open = todo.iter().zip(hit).map(|(todo, hit)| todo & !hit);
+    open.map(|open| u64::from(open.count_ones())).sum()
 }
 
 /// Marks the rays that can meet the ball around a box.
-fn mark_towards(
-    [min, max]: [Vec3; 2],
-    origin: Vec3,
-    samples: &PointSamples,
-    rays: usize,
-    todo: &mut [u64],
-) {
-    let to = (min + max) * 0.5 - origin;
+fn mark_towards([min, max]: [Vec3; 2], fan: &Fan<'_>, todo: &mut [u64]) {
+    let to = (min + max) * 0.5 - fan.origin;
     let radius_squared = (max - min).length_squared() * 0.25;
     let sin_squared = radius_squared / to.length_squared();
     if sin_squared < 1.0 {
         // A little wider, for rounding.
         let cos = (1.0 - sin_squared).sqrt() - 1e-4;
-        samples.within_cone(to.normalize(), cos, rays, todo);
+        fan.mark_cone(to.normalize(), cos, todo);
     } else {
-        set_bits(todo, 0..rays);
-    }
-}
-
-fn set_bits(words: &mut [u64], bits: Range<usize>) {
-    words.fill(0);
-    for bit in bits {
-        words[bit / 64] |= 1 << (bit % 64);
+        fan.directions.mark_given(0..fan.directions.len(), todo);
     }
 }
 
