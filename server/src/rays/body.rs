@@ -1,5 +1,7 @@
 //! Triangles under a tree, in one space.
 
+use std::collections::HashMap;
+
 use glam::{Affine3A, Vec3, Vec3A, Vec3Swizzles};
 use obvhs::{
     BvhBuildParams,
@@ -152,6 +154,16 @@ pub(super) struct Body {
     tree: Bvh2,
     /// Of all triangles, a little enlarged; not [`Aabb::valid`] where there are none.
     pub(super) bounds: Aabb,
+    pub(super) core: Option<Core>,
+}
+
+/// A ball that no ray from outside of a larger one gets into without a hit.
+#[derive(Clone, Copy)]
+pub(super) struct Core {
+    pub(super) center: Vec3A,
+    pub(super) radius: f32,
+    /// Of the larger one, which everything is within.
+    pub(super) outer_radius: f32,
 }
 
 /// How far boxes are enlarged, so that rounding in the test of a ray against a box never hides
@@ -172,6 +184,55 @@ fn scatter(x: u32) -> u32 {
     let x = (x ^ (x >> 16)).wrapping_mul(0x7feb_352d);
     let x = (x ^ (x >> 15)).wrapping_mul(0x846c_a68b);
     x ^ (x >> 16)
+}
+
+/// The balls around a place within a closed surface that touch no triangle, and that hold all;
+/// nothing where the surface is open, or the place outside.
+///
+/// Whatever else such a surface does, a ray between the one and outside of the other crosses it.
+fn core(corners: &[Corners], center: Vec3A) -> Option<Core> {
+    let mut edges: HashMap<[[u32; 3]; 2], u32> = HashMap::new();
+    let (mut least, mut farthest) = (f32::INFINITY, 0.0f32);
+    for c in corners {
+        let at = |i: usize| Vec3A::new(c.x[i], c.y[i], c.z[i]);
+        // Plus zero: -0 is the same place.
+        let bits = |i: usize| (at(i) + Vec3A::ZERO).to_array().map(f32::to_bits);
+        let (mut longest, mut nearest) = (0.0f32, f32::INFINITY);
+        for i in 0..3 {
+            let j = (i + 1) % 3;
+            let mut edge = [bits(i), bits(j)];
+            edge.sort_unstable();
+            *edges.entry(edge).or_default() += 1;
+            longest = longest.max(at(i).distance(at(j)));
+            nearest = nearest.min(at(i).distance(center));
+            farthest = farthest.max(at(i).distance(center));
+        }
+        // Its plane is no farther than a triangle; and no place on it is farther from all corners
+        // than the middle of an equilateral one.
+        let plane = c.normal.dot(at(0) - center).abs() / c.normal.length().max(f32::MIN_POSITIVE);
+        least = least.min(plane.max(nearest - longest * 0.578));
+    }
+    let ways = [
+        Vec3A::new(0.31, 0.87, 0.38),
+        Vec3A::new(-0.74, 0.11, 0.66),
+        Vec3A::new(0.52, -0.43, -0.74),
+    ];
+    let is_inside = |way: &Vec3A| {
+        let crossings = corners.iter().filter(|c| {
+            let ray = Ray::new_inf(center, *way);
+            c.hit(&ray).is_some()
+        });
+        crossings.count() % 2 == 1
+    };
+    // A little smaller, for rounding.
+    let radius = least * 0.999;
+    let closed = !corners.is_empty() && edges.values().all(|uses| uses % 2 == 0);
+    let usable = closed && radius > 0.0 && farthest.is_finite();
+    (usable && ways.iter().all(is_inside)).then_some(Core {
+        center,
+        radius,
+        outer_radius: farthest * 1.001,
+    })
 }
 
 /// Builds a binary tree with one box a leaf. Boxes are enlarged a little, each by another amount:
@@ -280,13 +341,21 @@ impl Body {
             ids,
             tree,
             bounds: Aabb::empty(),
+            core: None,
         };
         body.refit(corners);
         body
     }
 
+    /// Looks for a core. Only bodies that are not refitted keep it.
+    pub(super) fn with_core(mut self) -> Body {
+        self.core = core(&self.corners, self.bounds.center());
+        self
+    }
+
     /// Moves the triangles, given in their original order.
     pub(super) fn refit(&mut self, corners: &[Corners]) {
+        self.core = None;
         let tree = &mut self.tree;
         let pad = Vec3A::splat(padding(corners));
         self.corners.clear();
@@ -331,6 +400,9 @@ impl Body {
         let Some(root) = nodes.first() else { return };
         if rays.done() || rays.distance(root.aabb()) == f32::INFINITY {
             return;
+        }
+        if let Some(core) = &self.core {
+            rays.enter(core);
         }
         obvhs::fast_stack!(u32, (96, 192), self.tree.max_depth, stack, {
             let mut node = root;

@@ -8,7 +8,7 @@
 use glam::{Mat3A, Vec3, Vec3A};
 use obvhs::aabb::Aabb;
 
-use super::body::{Corners, Seen};
+use super::body::{Core, Corners, Seen};
 use super::lanes::{LANES, Lanes};
 
 /// Groups of a bundle: a bit each in a mask. A group has as many directions as there are lanes.
@@ -95,6 +95,11 @@ impl Directions {
     /// Sets the bits of those that had a number within `range` when they were given, and clears
     /// all others.
     pub fn mark_given(&self, range: std::ops::Range<usize>, bits: &mut [u64]) {
+        if range == (0..self.len()) {
+            bits.fill(u64::MAX);
+            self.clear_missing(bits);
+            return;
+        }
         bits.fill(0);
         for (word, part) in bits.iter_mut().zip(self.given.chunks(64)) {
             for (bit, given) in part.iter().enumerate() {
@@ -118,7 +123,12 @@ impl Directions {
                 }
             }
         }
-        // Missing directions have no length: a wide cone would count them.
+        // They have no length, so that a wide cone counts them.
+        self.clear_missing(bits);
+    }
+
+    /// Clears the bits after the last direction.
+    fn clear_missing(&self, bits: &mut [u64]) {
         let rest = self.len() % 64;
         if rest != 0
             && let Some(last) = bits.get_mut(self.len() / 64)
@@ -414,6 +424,49 @@ impl<'a, L: Lanes> Rays<'a, L> {
         }
     }
 
+    /// Tests all open rays against a core.
+    #[inline(always)]
+    pub(super) fn enter(&mut self, core: &Core) {
+        let l = self.lanes;
+        let to = core.center - self.origin;
+        let distance_squared = to.length_squared();
+        // From nearer, a ray might start within the surface. (False for what is not a number.)
+        let far = distance_squared > core.outer_radius * core.outer_radius;
+        if !far || !distance_squared.is_finite() {
+            return;
+        }
+        let outside = distance_squared - core.radius * core.radius;
+        let (outside, to) = (l.splat(outside), l.splat3(to.to_array()));
+        let (zero, t_max) = (l.splat(0.0), l.splat(self.t_max));
+        let mut groups = self.alive;
+        while groups != 0 {
+            let group = groups.trailing_zeros() as usize;
+            groups &= groups - 1;
+            let directions = self.directions_of(group);
+            let squared = l.dot(directions, directions);
+            let along = l.dot(to, directions);
+            let inner = l.sub(l.mul(along, along), l.mul(squared, outside));
+            // t = (along - sqrt(inner)) / squared, if it is less than t_max.
+            let least = l.sub(along, l.mul(t_max, squared));
+            let soon = l.or(l.gt(zero, least), l.gt(inner, l.mul(least, least)));
+            let hit = l.and(l.and(l.gt(along, zero), l.gt(inner, zero)), soon);
+            self.open[group] &= !(l.bits(hit) as u8);
+            if self.open[group] == 0 {
+                self.alive &= !(1 << group);
+            }
+        }
+    }
+
+    /// A group's directions in the tree's space.
+    #[inline(always)]
+    fn directions_of(&mut self, group: usize) -> [L::F; 3] {
+        if self.ready >> group & 1 == 0 {
+            self.ready |= 1 << group;
+            self.place(group);
+        }
+        self.directions[group]
+    }
+
     #[inline(always)]
     fn group(
         &mut self,
@@ -422,11 +475,7 @@ impl<'a, L: Lanes> Rays<'a, L> {
         id: u32,
         solid: &impl Fn(u32, f32, f32) -> bool,
     ) {
-        if self.ready >> group & 1 == 0 {
-            self.ready |= 1 << group;
-            self.place(group);
-        }
-        let directions = self.directions[group];
+        let directions = self.directions_of(group);
         let (inside, sides) = seen.sides(self.lanes, directions);
         let mut lanes = inside & u32::from(self.open[group]);
         if lanes == 0 {

@@ -362,11 +362,14 @@ impl CpuTracer {
             }
         }
         let rigid = |(mesh, placed): (&Mesh, &bool)| {
-            if *placed {
-                Body::new(&corners_of(mesh, &mesh.positions))
+            let corners = if *placed {
+                corners_of(mesh, &mesh.positions)
             } else {
-                Body::new(&[])
-            }
+                Vec::new()
+            };
+            let body = Body::new(&corners);
+            // Through holes, rays get anywhere.
+            if mesh.mask.is_some() { body } else { body.with_core() }
         };
         let mut tracer = CpuTracer {
             fixed: Body::new(&corners),
