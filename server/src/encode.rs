@@ -445,7 +445,7 @@ pub fn point_rmse(
     };
     if let Some(slices) = slices {
         for (slice, open) in world.slices.iter().zip(slices.get()) {
-            if sees(slice.bounds) {
+            if sees(slice.bounds) && world.is_present(slice.instance) {
                 let level = mirror.instances()[slice.instance as usize].level;
                 let mut have = slices.values(open).iter();
                 for (want, has) in world.occlusion(slice).iter().zip(world.levels(slice)) {

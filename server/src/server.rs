@@ -6,7 +6,8 @@ use crate::transport::{ClientId, Event, OwnedMessage, Room, Transport};
 use crate::world::{StepStats, World};
 use glam::{Affine3A, DAffine3, DVec3, Vec3};
 use psao::memory::Heap;
-use psao_core::{Mirror, uplink};
+use psao_core::Mirror;
+use psao_core::uplink::{self, Presence};
 use std::collections::BTreeMap;
 use std::time::Instant;
 
@@ -157,6 +158,9 @@ impl Server {
                 let world =
                     DAffine3::from_mat3_translation(rows.transpose(), DVec3::new(x.w, y.w, z.w));
                 self.world.drive(transform.instance, world)
+            }
+            OwnedMessage::Presence(Presence { instance, present }) => {
+                self.world.set_present(instance, present)
             }
             OwnedMessage::Joints { instance, matrices } => {
                 let joints = matrices.iter().map(|[x, y, z]| {

@@ -16,7 +16,7 @@ use psao_core::stream::{
     write_packet,
 };
 use psao_core::uplink::{
-    Camera, Hello, MAX_JOINTS, MAX_TOKEN_BYTES, MAX_UPLINK_BODY_BYTES, Message, Transform,
+    Camera, Hello, MAX_JOINTS, MAX_TOKEN_BYTES, MAX_UPLINK_BODY_BYTES, Message, Presence, Transform,
 };
 use quinn::crypto::rustls::QuicServerConfig;
 use quinn::{ConnectionError, Endpoint, Incoming, ReadExactError, RecvStream, SendStream, VarInt};
@@ -174,6 +174,8 @@ pub enum OwnedMessage {
     Ack(u32),
     /// A snapshot is needed.
     Resync,
+    /// An instance goes or comes.
+    Presence(Presence),
 }
 
 /// Listens for clients, on a thread of its own. Dropping it closes every connection.
@@ -653,6 +655,7 @@ async fn read_messages(
                 continue;
             }
             Message::Transform(transform) => (0, OwnedMessage::Transform(transform)),
+            Message::Presence(presence) => (0, OwnedMessage::Presence(presence)),
             Message::Joints(joints) => {
                 let matrices: Vec<_> = joints.matrices().collect();
                 let instance = joints.instance;

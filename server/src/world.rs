@@ -18,7 +18,7 @@ use psao_core::residual::BLOCK;
 use psao_core::topology::LEVELS;
 use psao_core::{Instance, Kernel};
 use rayon::prelude::*;
-use std::collections::{BTreeMap, HashSet};
+use std::collections::{BTreeMap, BTreeSet, HashSet};
 use std::ops::Range;
 use std::sync::Arc;
 
@@ -116,6 +116,9 @@ impl From<PointError> for WorldError {
     }
 }
 
+/// How far below the scene instances are that are not in it.
+const AWAY_M: f32 = 1e7;
+
 /// Most points of a scene: about 90 bytes each.
 pub const MAX_POINTS: u64 = 1 << 26;
 
@@ -210,6 +213,8 @@ pub struct World {
     /// Space for what the traced points say, kept from step to step.
     traced: Vec<u8>,
     driven: BTreeMap<u32, DAffine3>,
+    /// Instances that are out of the scene for now.
+    absent: BTreeSet<u32>,
     posed: BTreeMap<u32, Vec<Affine3A>>,
     previous: Pose,
 }
@@ -265,6 +270,7 @@ impl World {
             swept: vec![[Hull::default(); 2]; scene.instances.len()],
             traced: Vec::new(),
             driven: BTreeMap::new(),
+            absent: BTreeSet::new(),
             posed: BTreeMap::new(),
             previous: pose.clone(),
             moves,
@@ -489,6 +495,33 @@ impl World {
         Ok(())
     }
 
+    /// Takes an instance out of the scene, or puts it back where it would be: it neither has
+    /// occlusion nor gives any while it is out.
+    ///
+    /// # Errors
+    /// There is no such instance.
+    pub fn set_present(&mut self, instance: u32, present: bool) -> Result<(), NoInstance> {
+        if instance as usize >= self.scene.instances.len() {
+            return Err(NoInstance(instance));
+        }
+        if present {
+            self.absent.remove(&instance);
+        } else if self.absent.insert(instance) && !self.moves[instance as usize] {
+            self.promote(instance);
+        }
+        Ok(())
+    }
+
+    /// The instances that are not in the scene.
+    pub fn absent(&self) -> impl Iterator<Item = u32> + '_ {
+        self.absent.iter().copied()
+    }
+
+    /// Whether an instance is in the scene.
+    pub fn is_present(&self, instance: u32) -> bool {
+        !self.absent.contains(&instance)
+    }
+
     /// The engine (or a client) poses a skinned instance from now on: local from rest, a joint.
     ///
     /// # Errors
@@ -568,6 +601,11 @@ impl World {
                 ..*world
             };
             self.pose.instances[instance as usize].world_from_local = single(local);
+        }
+        for &instance in &self.absent {
+            // Out of everything's reach: it moves away as any mover does.
+            let place = &mut self.pose.instances[instance as usize].world_from_local;
+            place.translation = Vec3A::NEG_Y * AWAY_M;
         }
         for (&instance, joints) in &self.posed {
             self.pose.instances[instance as usize]
@@ -718,7 +756,7 @@ impl World {
         let mut due: Vec<(usize, usize)> = Vec::new();
         let mut budget = converge_rays;
         for (index, slice) in self.slices.iter().enumerate() {
-            if !visible(slice.bounds) {
+            if !visible(slice.bounds) || self.absent.contains(&slice.instance) {
                 continue;
             }
             let points = slice.points.len() as u64;

@@ -16,7 +16,7 @@
 use psao_core::mirror::Capacity;
 use psao_core::stream::{PACKET_HEADER_BYTES, Packet, StreamError, Writer, write_packet};
 use psao_core::uplink::{
-    self, Camera, Hello, MAX_TOKEN_BYTES, MAX_UPLINK_BODY_BYTES, Message, Transform, kind,
+    self, Camera, Hello, MAX_TOKEN_BYTES, MAX_UPLINK_BODY_BYTES, Message, Presence, Transform, kind,
 };
 use quinn::crypto::rustls::QuicClientConfig;
 use quinn::{ConnectionError, Endpoint, ReadError, RecvStream, SendStream, VarInt};
@@ -468,6 +468,14 @@ impl Connection {
     /// The connection is closed or busy.
     pub fn resync(&self) -> Result<(), Unsent> {
         self.reliable(kind::RESYNC, 0, |_| Ok(()))
+    }
+
+    /// Takes an instance out of the scene, or puts it back. Threads: any.
+    ///
+    /// # Errors
+    /// The connection is closed or busy.
+    pub fn presence(&self, presence: &Presence) -> Result<(), Unsent> {
+        self.reliable(kind::PRESENCE, 8, |w| presence.write(w))
     }
 
     /// Closes the connection and tells the server, as dropping does. Waits at most 1 s.

@@ -35,6 +35,8 @@ pub mod kind {
     pub const ACK: u8 = 68;
     /// [`super::Message::Resync`]
     pub const RESYNC: u8 = 69;
+    /// [`super::Presence`]
+    pub const PRESENCE: u8 = 70;
 }
 
 /// The client introduces itself.
@@ -78,6 +80,15 @@ pub struct Transform {
     pub world_from_local: [[f64; 4]; 3],
 }
 
+/// The engine took an instance out of the scene, or put it back. All are there at first.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Presence {
+    /// Instance index.
+    pub instance: u32,
+    /// It is there.
+    pub present: bool,
+}
+
 /// The engine posed a skinned instance.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Joints<'a> {
@@ -118,6 +129,8 @@ pub enum Message<'a> {
     Ack(u32),
     /// The client's mirror is not what it should be: a snapshot is needed.
     Resync,
+    /// Instance that is there or not.
+    Presence(Presence),
 }
 
 impl<'a> Message<'a> {
@@ -125,7 +138,7 @@ impl<'a> Message<'a> {
     /// fields belong to a newer minor version and are ignored.
     pub fn read(packet: &Packet<'a>) -> Result<Option<Message<'a>>, StreamError> {
         let mut r = Reader(packet.body);
-        if (kind::HELLO..=kind::RESYNC).contains(&packet.kind) {
+        if (kind::HELLO..=kind::PRESENCE).contains(&packet.kind) {
             packet.check_flags(0)?;
         }
         let message = match packet.kind {
@@ -203,6 +216,16 @@ impl<'a> Message<'a> {
             }
             kind::ACK => Message::Ack(r.u32()?),
             kind::RESYNC => Message::Resync,
+            kind::PRESENCE => {
+                let (instance, present) = (r.u32()?, r.u8()?);
+                if present > 1 || r.array::<3>()? != [0; 3] {
+                    return Err(StreamError::Value);
+                }
+                Message::Presence(Presence {
+                    instance,
+                    present: present == 1,
+                })
+            }
             _ if packet.flags & crate::stream::flag::OPTIONAL != 0 => return Ok(None),
             other => return Err(StreamError::Kind(other)),
         };
@@ -284,6 +307,14 @@ impl Transform {
             .as_flattened()
             .iter()
             .try_for_each(|v| w.f64(*v))
+    }
+}
+
+impl Presence {
+    /// Writes the body of a [`kind::PRESENCE`] packet.
+    pub fn write(&self, w: &mut Writer<'_>) -> Result<(), StreamError> {
+        w.u32(self.instance)?;
+        w.bytes(&[u8::from(self.present), 0, 0, 0])
     }
 }
 

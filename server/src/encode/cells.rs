@@ -87,8 +87,12 @@ impl Cells {
         let truth = &world.truth;
         self.select(world, view);
         let instances: Vec<(u32, Instance)> = (0..truth.instances.len())
-            .filter(|&i| self.mirror.instances()[i] != truth.instances[i])
-            .map(|i| (i as u32, truth.instances[i]))
+            .map(|i| {
+                let present = world.is_present(i as u32);
+                let none = Instance::default();
+                (i as u32, if present { truth.instances[i] } else { none })
+            })
+            .filter(|(i, want)| self.mirror.instances()[*i as usize] != *want)
             .collect();
         let buckets: Vec<(u32, Bucket)> = elements(&self.send_buckets, &truth.buckets);
         let cells: Vec<(u32, Cell)> = elements(&self.send_cells, &truth.cells);
@@ -138,7 +142,7 @@ impl Cells {
             };
         let mut seen_instance = vec![false; truth.instances.len()];
         for slice in &world.slices {
-            if (view.sees)(slice.bounds) {
+            if (view.sees)(slice.bounds) && world.is_present(slice.instance) {
                 seen_instance[slice.instance as usize] = true;
                 let range = slice.cells.start as usize..slice.cells.end as usize;
                 gather(&mut self.due_cells, range, &|_| true);

@@ -184,8 +184,9 @@ impl Residual {
         } else {
             f64::INFINITY
         };
-        let lacks = self.lacks(world, view);
         let mut out = Frame::default();
+        self.drop_absent(world, &mut out);
+        let lacks = self.lacks(world, view);
         self.choose_levels(world, view, &lacks, room, &mut out);
         // All of an instance's slices change level in one frame, so that none is missing.
         let (mut now, mut later): (Vec<Lack>, Vec<Lack>) = (Vec::new(), Vec::new());
@@ -230,7 +231,7 @@ impl Residual {
         let lacks = world.slices.par_iter().zip(seen).enumerate();
         lacks
             .filter_map(|(index, (slice, seen))| {
-                if !(view.sees)(slice.bounds) {
+                if !(view.sees)(slice.bounds) || !world.is_present(slice.instance) {
                     return None;
                 }
                 *seen = frames;
@@ -269,6 +270,24 @@ impl Residual {
                 })
             })
             .collect()
+    }
+
+    /// Takes instances from the client that are out of the scene.
+    fn drop_absent(&mut self, world: &World, out: &mut Frame) {
+        for instance in world.absent() {
+            if self.mirror.instances()[instance as usize].bucket_count > 0 {
+                for index in self.open_slices(world, instance) {
+                    self.close(index, out);
+                }
+                self.set_instance(instance, Instance::default(), out);
+            }
+        }
+    }
+
+    fn open_slices(&self, world: &World, instance: u32) -> Vec<u32> {
+        let heap = self.heap.get();
+        let is_open = |slice: &u32| heap[*slice as usize].point_count > 0;
+        world.slices_of(instance).filter(is_open).collect()
     }
 
     /// Gives instances the level of detail that their distance asks for.
@@ -312,10 +331,7 @@ impl Residual {
             }
             let grid = world.grid(instance, level);
             let slices = world.slices_of(instance);
-            let open: Vec<u32> = slices
-                .clone()
-                .filter(|&slice| self.heap.get()[slice as usize].point_count > 0)
-                .collect();
+            let open = self.open_slices(world, instance);
             if open.is_empty() {
                 self.set_instance(instance, grid, out);
                 continue;
