@@ -75,6 +75,9 @@ pub struct Figures {
     pub points: usize,
     /// Cells in use.
     pub cells: u32,
+    /// Share of the cells of all that came into view which the client need not have, as everything
+    /// in and around them is open.
+    pub cells_skipped_share: f64,
     /// Buckets.
     pub buckets: usize,
     /// Instances of the scene.
@@ -233,7 +236,10 @@ pub fn run(args: &DemoArgs, progress: Progress<'_>) -> Result<Figures, String> {
     let counts = link.client.mirror();
     figures.mirror_matches &= counts.hash() == counts.recompute_hash();
     figures.client_bytes = link.client.memory_bytes();
-    figures.cells = server.world.truth.used_cells();
+    let cells = link.client.mirror().cells().iter();
+    figures.cells = cells.filter(|cell| !cell.is_empty()).count() as u32;
+    let all_cells = server.cells_of(id).map_or(figures.cells as usize, |[_, all]| all);
+    figures.cells_skipped_share = 1.0 - f64::from(figures.cells) / all_cells.max(1) as f64;
     figures.discarded_points = server.world.discarded();
     figures.summarise(&rows, &shots);
     write_results(args, &figures, &rows, &shots)?;
@@ -517,8 +523,13 @@ impl Figures {
                 format!("{} ({} discarded)", self.points, self.discarded_points),
             ),
             row(
-                "cells, buckets",
-                format!("{}, {}", self.cells, self.buckets),
+                "client's cells, buckets",
+                format!(
+                    "{}, {} ({:.0} % of the cells are open, and left out)",
+                    self.cells,
+                    self.buckets,
+                    self.cells_skipped_share * 100.0
+                ),
             ),
             row("ready to stream after", format!("{:.1} s", self.ready_s)),
             row(

@@ -264,6 +264,11 @@ impl Server {
         self.viewers.get(&id).map(|viewer| viewer.encoder.mirror())
     }
 
+    /// [`Encoder::cells`] of a client.
+    pub fn cells_of(&self, id: ClientId) -> Option<[usize; 2]> {
+        self.viewers.get(&id)?.encoder.cells(&self.world)
+    }
+
     /// [`point_rmse`] of what a client has, over what that client sees.
     pub fn point_rmse(&self, id: ClientId, client: &psao::Client) -> Option<f64> {
         let viewer = self.viewers.get(&id)?;
