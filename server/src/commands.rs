@@ -447,8 +447,8 @@ impl Player {
             row(
                 "changes",
                 format!(
-                    "{} cells, {} buckets, {} instances",
-                    stats.cells, stats.buckets, stats.instances
+                    "{} cells, {} buckets, {} instances, {} slices, {} patches",
+                    stats.cells, stats.buckets, stats.instances, stats.slices, stats.patches
                 ),
             ),
             row(
@@ -516,6 +516,7 @@ pub fn inspect(args: &InspectArgs, out: &mut dyn Write) -> Result<(), String> {
                     (packets, frame_bytes) = (0, 0);
                 }
             }
+            kind::PATCHES => print(out, format!("patches, {length} bytes"))?,
             kind::END => print(out, "end".into())?,
             kind::REFUSE => {
                 let code = packet
