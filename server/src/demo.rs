@@ -238,7 +238,9 @@ pub fn run(args: &DemoArgs, progress: Progress<'_>) -> Result<Figures, String> {
     figures.client_bytes = link.client.memory_bytes();
     let cells = link.client.mirror().cells().iter();
     figures.cells = cells.filter(|cell| !cell.is_empty()).count() as u32;
-    let all_cells = server.cells_of(id).map_or(figures.cells as usize, |[_, all]| all);
+    let all_cells = server
+        .cells_of(id)
+        .map_or(figures.cells as usize, |[_, all]| all);
     figures.cells_skipped_share = 1.0 - f64::from(figures.cells) / all_cells.max(1) as f64;
     figures.discarded_points = server.world.discarded();
     figures.summarise(&rows, &shots);

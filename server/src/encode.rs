@@ -326,6 +326,66 @@ impl Encoder {
         }
     }
 
+    /// Root mean square difference between what a client has and the truth, in 1/255, over the
+    /// points of the slices that `sees` sees. `slices`: the client's, of profile `residual`; there
+    /// slices of which nothing was in sight yet do not count.
+    pub fn point_rmse(
+        &self,
+        world: &World,
+        mirror: &Mirror<Heap>,
+        slices: Option<&SliceHeap>,
+        sees: &(dyn Fn([Vec3; 2]) -> bool + Sync),
+    ) -> f64 {
+        let (mut sum, mut count) = (0u64, 0u64);
+        // A point the client does not have counts as wholly wrong.
+        let mut add = |want: u8, have: Option<u8>| {
+            let off = have.map_or(255, |have| u64::from(want.abs_diff(have)));
+            sum += off * off;
+            count += 1;
+        };
+        if let Some(slices) = slices {
+            for (index, (slice, open)) in world.slices.iter().zip(slices.get()).enumerate() {
+                let needed = match &self.sent {
+                    Sent::Cells(_) => true,
+                    Sent::Residual(sent) => sent.needs(index),
+                };
+                if needed && sees(slice.bounds) && world.is_present(slice.instance) {
+                    let level = mirror.instances()[slice.instance as usize].level;
+                    let mut have = slices.values(open).iter();
+                    for (want, has) in world.occlusion(slice).iter().zip(world.levels(slice)) {
+                        if u32::from(*has) >= level {
+                            add(*want, have.next().copied());
+                        }
+                    }
+                }
+            }
+            return (sum as f64 / count.max(1) as f64).sqrt();
+        }
+        let mut add_cell = |cell: usize| {
+            let (want, have) = (&world.truth.cells[cell], &mirror.cells()[cell]);
+            for (want, have) in want.points.iter().zip(&have.points) {
+                if want.is_allocated() {
+                    add(
+                        want.occlusion(),
+                        have.is_allocated().then(|| have.occlusion()),
+                    );
+                }
+            }
+        };
+        let mut seen_instance = vec![false; world.truth.instances.len()];
+        for slice in world.slices.iter().filter(|slice| sees(slice.bounds)) {
+            seen_instance[slice.instance as usize] = true;
+            slice.cells.clone().for_each(|cell| add_cell(cell as usize));
+        }
+        for cell in world.loose_cells as usize..world.truth.cells.len() {
+            let home = world.truth.home(cell as u32);
+            if seen_instance[world.instance_of_bucket(home) as usize] {
+                add_cell(cell);
+            }
+        }
+        (sum as f64 / count.max(1) as f64).sqrt()
+    }
+
     /// The number of the last frame.
     pub fn frame_id(&self) -> u32 {
         self.frame_id
@@ -426,58 +486,4 @@ fn compress(zstd: &mut CCtx<'_>, raw: &[u8]) -> Vec<u8> {
     zstd.compress2(&mut out, raw)
         .expect("zstd has the room it asked for");
     out
-}
-
-/// Root mean square difference between what a client has and the truth, in 1/255, over the points
-/// of the slices that `sees` sees. `slices`: of profile `residual`.
-pub fn point_rmse(
-    world: &World,
-    mirror: &Mirror<Heap>,
-    slices: Option<&SliceHeap>,
-    sees: &(dyn Fn([Vec3; 2]) -> bool + Sync),
-) -> f64 {
-    let (mut sum, mut count) = (0u64, 0u64);
-    // A point the client does not have counts as wholly wrong.
-    let mut add = |want: u8, have: Option<u8>| {
-        let off = have.map_or(255, |have| u64::from(want.abs_diff(have)));
-        sum += off * off;
-        count += 1;
-    };
-    if let Some(slices) = slices {
-        for (slice, open) in world.slices.iter().zip(slices.get()) {
-            if sees(slice.bounds) && world.is_present(slice.instance) {
-                let level = mirror.instances()[slice.instance as usize].level;
-                let mut have = slices.values(open).iter();
-                for (want, has) in world.occlusion(slice).iter().zip(world.levels(slice)) {
-                    if u32::from(*has) >= level {
-                        add(*want, have.next().copied());
-                    }
-                }
-            }
-        }
-        return (sum as f64 / count.max(1) as f64).sqrt();
-    }
-    let mut add_cell = |cell: usize| {
-        let (want, have) = (&world.truth.cells[cell], &mirror.cells()[cell]);
-        for (want, have) in want.points.iter().zip(&have.points) {
-            if want.is_allocated() {
-                add(
-                    want.occlusion(),
-                    have.is_allocated().then(|| have.occlusion()),
-                );
-            }
-        }
-    };
-    let mut seen_instance = vec![false; world.truth.instances.len()];
-    for slice in world.slices.iter().filter(|slice| sees(slice.bounds)) {
-        seen_instance[slice.instance as usize] = true;
-        slice.cells.clone().for_each(|cell| add_cell(cell as usize));
-    }
-    for cell in world.loose_cells as usize..world.truth.cells.len() {
-        let home = world.truth.home(cell as u32);
-        if seen_instance[world.instance_of_bucket(home) as usize] {
-            add_cell(cell);
-        }
-    }
-    (sum as f64 / count.max(1) as f64).sqrt()
 }

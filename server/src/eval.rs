@@ -8,9 +8,7 @@
 use crate::args::{ProfileArg, SceneArgs, camera_path};
 use crate::camera::{CameraPath, Frustum};
 use crate::demo::parse_size;
-use crate::encode::{
-    Compression, Encoder, Eye, Limits, Scheme, View as Sight, capacity_of, point_rmse,
-};
+use crate::encode::{Compression, Encoder, Eye, Limits, Scheme, View as Sight, capacity_of};
 use crate::metrics::Pair;
 use crate::picture::write_whole;
 use crate::render::{REFERENCE_RAYS, View};
@@ -520,7 +518,9 @@ impl Stream {
             topology_bytes: packets_bytes(&self.bytes, kind::PATCHES)?,
             encode_ms,
             decode_ms,
-            rmse_255: point_rmse(world, mine, self.encoder.slices(), sight.sees),
+            rmse_255: self
+                .encoder
+                .point_rmse(world, mine, self.encoder.slices(), sight.sees),
             points,
         });
         self.client.clear_dirty();

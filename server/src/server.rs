@@ -1,7 +1,7 @@
 //! The server's frame, top to bottom: what clients say, the world's step, a frame a client.
 
 use crate::camera::{Camera, Frustum};
-use crate::encode::{Encoder, Eye, FrameStats, Scheme, View, point_rmse};
+use crate::encode::{Encoder, Eye, FrameStats, Scheme, View};
 use crate::transport::{ClientId, Event, OwnedMessage, Room, Transport};
 use crate::world::{StepStats, World};
 use glam::{Affine3A, DAffine3, DVec3, Vec3};
@@ -275,7 +275,8 @@ impl Server {
         let residual = matches!(self.settings.scheme, Scheme::Residual(..));
         let slices = residual.then(|| client.slices());
         let sees = |bounds: [Vec3; 2]| viewer.sees(bounds);
-        Some(point_rmse(&self.world, client.mirror(), slices, &sees))
+        let encoder = &viewer.encoder;
+        Some(encoder.point_rmse(&self.world, client.mirror(), slices, &sees))
     }
 }
 

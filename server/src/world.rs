@@ -116,6 +116,9 @@ impl From<PointError> for WorldError {
     }
 }
 
+/// How far a camera may have moved before the points that it then sees are there, metres.
+const LOOKAHEAD_M: f32 = 0.7;
+
 /// How far below the scene instances are that are not in it.
 const AWAY_M: f32 = 1e7;
 
@@ -1025,6 +1028,43 @@ impl World {
             bucket_first: own.bucket_first,
             ..set.levels[level as usize].grid
         }
+    }
+
+    /// Whether any of some points of a slice, which `seed` chooses, can be seen from `eye` or from
+    /// less than [`LOOKAHEAD_M`] around it.
+    pub fn is_seen(&self, slice: &Slice, eye: Vec3, samples: u32, seed: u32) -> bool {
+        let triangles = &self.mesh(slice.instance).triangles;
+        let (positions, normals) = self.vertices(slice.instance);
+        let pose = &self.pose.instances[slice.instance as usize];
+        let reach = self.reach(slice.instance);
+        let count = slice.points.len() as u32;
+        let mut random = seed;
+        let mut next = || {
+            random = random.wrapping_mul(747_796_405).wrapping_add(2_891_336_453);
+            let mixed = (random >> 16 ^ random).wrapping_mul(0x7feb_352d);
+            mixed ^ mixed >> 15
+        };
+        (0..samples).any(|sample| {
+            let number = slice.points.start + next() % count.max(1);
+            let point = &self.points[number as usize];
+            let position = point.position(triangles, positions);
+            let position = pose.world_from_local.transform_point3(position);
+            let outward = pose.world_normal(point.geometric_normal(triangles, positions));
+            let facing = pose.world_normal(point.normal(triangles, positions, normals));
+            let origin = offset_origin(position, outward, reach);
+            // Every other time from where it may be soon.
+            let mut aside = || ((next() >> 8) as f32 / (1 << 23) as f32 - 1.0) * LOOKAHEAD_M;
+            let aside = Vec3::new(aside(), aside(), aside());
+            let eye = if sample % 2 == 0 { eye } else { eye + aside };
+            let (direction, far) = (eye - origin).normalize_and_length();
+            if direction.dot(facing).max(direction.dot(outward)) <= 0.0 {
+                return false;
+            }
+            let mut hit = [0];
+            self.tracer
+                .occluded(Against::All, origin, &[direction], far, &[1], &mut hit);
+            hit == [0]
+        })
     }
 
     /// Numbers of an instance's slices.

@@ -41,6 +41,12 @@ impl Limits {
 /// Largest content of a packet of patches or slices.
 const PACKET_BYTES: usize = 1 << 18;
 
+/// Points of a slice that are looked for from the camera until one is in sight: when the slice comes
+/// into the frustum, and in every how manieth frame from then on. What is behind walls so waits.
+const FIRST_LOOKS: u32 = 64;
+const LOOKS: u32 = 16;
+const LOOK_EVERY: u64 = 3;
+
 /// Slices coded side by side before the budget is looked at again.
 const BATCH: usize = 64;
 
@@ -62,6 +68,8 @@ pub struct Residual {
     due: Vec<bool>,
     /// The frame in which each slice was last in view.
     seen: Vec<u64>,
+    /// Slices of which something was in sight, not only in the frustum.
+    sighted: Vec<bool>,
     frames: u64,
     /// Slices on their way from one level's picture to another's.
     fades: BTreeMap<u32, Fade>,
@@ -125,7 +133,9 @@ impl Residual {
             has_patch: vec![has_patches; capacity.patches as usize],
             due: vec![true; world.slices.len()],
             seen: vec![0; world.slices.len()],
-            frames: 0,
+            sighted: vec![false; world.slices.len()],
+            // So that no slice was seen in the frame before the first.
+            frames: 1,
             fades: BTreeMap::new(),
             space: Space::new(capacity.points),
             debt: 0.0,
@@ -145,6 +155,11 @@ impl Residual {
             }
         }
         [has.count(), all.len()]
+    }
+
+    /// Whether the client needs a slice that its frustum holds.
+    pub fn needs(&self, slice: usize) -> bool {
+        self.sighted[slice]
     }
 
     pub fn capacity(&self) -> Capacity {
@@ -227,14 +242,29 @@ impl Residual {
         let (frames, quantiser) = (self.frames, self.quantiser);
         let (heap, due, fades) = (&self.heap, &self.due, &self.fades);
         let mirror = &self.mirror;
-        let seen = &mut self.seen;
-        let lacks = world.slices.par_iter().zip(seen).enumerate();
+        let marks = self.seen.par_iter_mut().zip(&mut self.sighted);
+        let lacks = world.slices.par_iter().zip(marks).enumerate();
         lacks
-            .filter_map(|(index, (slice, seen))| {
+            .filter_map(|(index, (slice, (seen, sighted)))| {
                 if !(view.sees)(slice.bounds) || !world.is_present(slice.instance) {
                     return None;
                 }
+                let since = frames - *seen;
                 *seen = frames;
+                if !*sighted {
+                    *sighted = view.eye.is_none_or(|eye| {
+                        let seed = (frames as u32).wrapping_mul(0x9e37_79b9) ^ index as u32;
+                        let samples = match since {
+                            1 if (frames + index as u64).is_multiple_of(LOOK_EVERY) => LOOKS,
+                            0 | 1 => 0,
+                            _ => FIRST_LOOKS,
+                        };
+                        world.is_seen(slice, eye.position, samples, seed)
+                    });
+                    if !*sighted {
+                        return None;
+                    }
+                }
                 let open = &heap.get()[index];
                 let opens = open.point_count == 0;
                 let fading = fades.contains_key(&(index as u32));
