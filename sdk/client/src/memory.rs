@@ -1,28 +1,235 @@
-//! Heap memory for a mirror, taken once.
+//! A client's memory: typed pieces, from the heap or all of one block that somebody lends.
+//!
+//! Whatever a client keeps is a [`Piece`]. Each is asked of a [`Source`] with the most that it may
+//! ever have to hold, and given its present length when a stream's header says it. So one list of
+//! pieces measures the block, cuts it up and takes the heap's share.
 
+use bytemuck::{Pod, Zeroable};
 use psao_core::mirror::{Capacity, Memory, Parts, PartsMut};
 use psao_core::residual::Neighbours;
 use psao_core::slices::{Slice, Slices};
+use psao_core::stream::{Header, MAX_BODY_BYTES, MAX_RAW_BYTES};
 use psao_core::{Bucket, Cell, Instance};
+use std::ops::{Deref, DerefMut};
 
-/// A mirror's buffers on the heap; never grows.
-#[derive(Clone, Debug, Default)]
+/// 64 bytes, a cache line: what lent memory is made of. Every piece begins with one.
+#[repr(C, align(64))]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+pub struct Line(pub [u8; 64]);
+
+/// The most that a stream may ask a client to keep.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Limits {
+    /// Largest mirror.
+    pub capacity: Capacity,
+    /// Most slices (profile `residual`).
+    pub slices: u32,
+    /// Most points of all slices (profile `residual`).
+    pub points: u32,
+    /// Largest packet body, bytes.
+    pub body_bytes: u32,
+    /// Largest decompressed content of a packet, bytes.
+    pub raw_bytes: u32,
+}
+
+impl Limits {
+    /// What any stream with a mirror of at most this capacity needs.
+    pub fn of_any(capacity: Capacity) -> Limits {
+        Limits {
+            capacity,
+            slices: u32::MAX,
+            points: u32::MAX,
+            body_bytes: MAX_BODY_BYTES,
+            raw_bytes: MAX_RAW_BYTES,
+        }
+    }
+
+    /// What the stream with this header needs.
+    pub fn of(header: &Header) -> Limits {
+        Limits {
+            capacity: header.capacity,
+            slices: header.slices,
+            points: header.points,
+            body_bytes: header.max_body_bytes,
+            raw_bytes: header.max_raw_bytes,
+        }
+    }
+
+    /// Nothing in `self` is more than in `most`.
+    pub fn fit(&self, most: &Limits) -> bool {
+        capacity_fits(self.capacity, most.capacity)
+            && self.slices <= most.slices
+            && self.points <= most.points
+            && self.body_bytes <= most.body_bytes
+            && self.raw_bytes <= most.raw_bytes
+    }
+}
+
+/// A mirror of one capacity has room in that of another.
+pub fn capacity_fits(need: Capacity, most: Capacity) -> bool {
+    need.instances <= most.instances && need.buckets <= most.buckets && need.cells <= most.cells
+}
+
+/// Where pieces come from.
+#[derive(Debug)]
+pub enum Source {
+    /// The heap. Pieces are empty until they are given a length.
+    Heap,
+    /// A block that is cut up from its front.
+    Lent(&'static mut [Line]),
+    /// Nowhere: counts the lines of the block that would do.
+    Measure(u64),
+}
+
+impl Source {
+    /// A piece of at most `most` elements, none of them in use.
+    ///
+    /// # Panics
+    /// If the block is too short: measure it first.
+    pub fn piece<T: Pod>(&mut self, most: u64) -> Piece<T> {
+        let lines = most
+            .saturating_mul(size_of::<T>() as u64)
+            .div_ceil(size_of::<Line>() as u64);
+        match self {
+            Source::Heap => Piece {
+                memory: Place::Heap(Vec::new()),
+                length: 0,
+            },
+            Source::Measure(total) => {
+                *total = total.saturating_add(lines);
+                Source::Heap.piece(0)
+            }
+            Source::Lent(block) => {
+                let (piece, rest) = std::mem::take(block).split_at_mut(lines as usize);
+                *block = rest;
+                let bytes: &mut [u8] = bytemuck::cast_slice_mut(piece);
+                let whole = bytes.len() / size_of::<T>() * size_of::<T>();
+                let elements = bytemuck::cast_slice_mut(&mut bytes[..whole]);
+                Piece {
+                    memory: Place::Lent(elements),
+                    length: 0,
+                }
+            }
+        }
+    }
+}
+
+/// A list of elements, from the heap or lent.
+#[derive(Debug)]
+pub struct Piece<T: 'static> {
+    memory: Place<T>,
+    length: usize,
+}
+
+#[derive(Debug)]
+enum Place<T: 'static> {
+    Heap(Vec<T>),
+    Lent(&'static mut [T]),
+}
+
+impl<T: Pod> Piece<T> {
+    /// Makes it `length` elements, all zero. From the heap, memory is taken anew; a lent piece
+    /// must have room.
+    ///
+    /// # Panics
+    /// If a lent piece has no room: lengths are checked against [`Limits`] before.
+    pub fn resize_zeroed(&mut self, length: usize) {
+        match &mut self.memory {
+            Place::Heap(elements) => {
+                // The old one goes first, so that both are never held at once.
+                *elements = Vec::new();
+                *elements = vec![T::zeroed(); length];
+            }
+            Place::Lent(elements) => elements[..length].fill(T::zeroed()),
+        }
+        self.length = length;
+    }
+
+    /// Bytes in use.
+    pub fn bytes(&self) -> u64 {
+        size_of_val::<[T]>(self) as u64
+    }
+}
+
+impl<T> Deref for Piece<T> {
+    type Target = [T];
+
+    fn deref(&self) -> &[T] {
+        match &self.memory {
+            Place::Heap(elements) => elements,
+            Place::Lent(elements) => &elements[..self.length],
+        }
+    }
+}
+
+impl<T> DerefMut for Piece<T> {
+    fn deref_mut(&mut self) -> &mut [T] {
+        match &mut self.memory {
+            Place::Heap(elements) => elements,
+            Place::Lent(elements) => &mut elements[..self.length],
+        }
+    }
+}
+
+impl<T: Pod> Clone for Piece<T> {
+    /// A copy on the heap.
+    fn clone(&self) -> Piece<T> {
+        Piece {
+            memory: Place::Heap(self.to_vec()),
+            length: self.length,
+        }
+    }
+}
+
+/// A mirror's buffers, on the heap unless they were lent.
+#[derive(Clone, Debug)]
 pub struct Heap {
-    instances: Vec<Instance>,
-    buckets: Vec<Bucket>,
-    cells: Vec<Cell>,
-    dirty: Vec<u64>,
+    instances: Piece<Instance>,
+    buckets: Piece<Bucket>,
+    cells: Piece<Cell>,
+    dirty: Piece<u64>,
+}
+
+impl Default for Heap {
+    fn default() -> Heap {
+        Heap::new(Capacity::default())
+    }
 }
 
 impl Heap {
-    /// Zeroed buffers of the given capacity.
+    /// Zeroed buffers of the given capacity, on the heap.
     pub fn new(capacity: Capacity) -> Heap {
+        let mut heap = Heap::from(&mut Source::Heap, capacity);
+        heap.resize(capacity);
+        heap
+    }
+
+    /// Empty buffers with room for a capacity.
+    pub fn from(source: &mut Source, most: Capacity) -> Heap {
         Heap {
-            instances: vec![Instance::default(); capacity.instances as usize],
-            buckets: vec![Bucket::default(); capacity.buckets as usize],
-            cells: vec![Cell::default(); capacity.cells as usize],
-            dirty: vec![0; capacity.dirty_words()],
+            instances: source.piece(u64::from(most.instances)),
+            buckets: source.piece(u64::from(most.buckets)),
+            cells: source.piece(u64::from(most.cells)),
+            dirty: source.piece(most.dirty_words() as u64),
         }
+    }
+
+    /// Makes the buffers as long as a capacity says, all zero.
+    pub fn resize(&mut self, capacity: Capacity) {
+        self.instances.resize_zeroed(capacity.instances as usize);
+        self.buckets.resize_zeroed(capacity.buckets as usize);
+        self.cells.resize_zeroed(capacity.cells as usize);
+        self.dirty.resize_zeroed(capacity.dirty_words());
+    }
+
+    /// As [`Heap::resize`], so that all of it is dirty in a mirror made of it: whoever uploads
+    /// has to fill buffers of another length anew. A mirror that begins takes away whatever is
+    /// not zero, and what it takes away has changed.
+    pub(crate) fn resize_changed(&mut self, capacity: Capacity) {
+        self.resize(capacity);
+        bytemuck::cast_slice_mut::<_, u8>(&mut self.instances).fill(1);
+        bytemuck::cast_slice_mut::<_, u8>(&mut self.buckets).fill(1);
+        bytemuck::cast_slice_mut::<_, u8>(&mut self.cells).fill(1);
     }
 }
 
@@ -58,24 +265,45 @@ impl Memory for Heap {
     }
 }
 
-/// What the residual codec keeps beside a mirror; never grows.
-#[derive(Clone, Debug, Default)]
+/// What the residual codec keeps beside a mirror.
+#[derive(Clone, Debug)]
 pub struct SliceHeap {
-    slices: Vec<Slice>,
-    neighbours: Vec<Neighbours>,
-    last: Vec<i8>,
+    slices: Piece<Slice>,
+    neighbours: Piece<Neighbours>,
+    last: Piece<i8>,
     points_used: u32,
 }
 
+impl Default for SliceHeap {
+    fn default() -> SliceHeap {
+        SliceHeap::new(0, 0)
+    }
+}
+
 impl SliceHeap {
-    /// Room for slices and their points, none of them open.
+    /// Room for slices and their points, none of them open, on the heap.
     pub fn new(slices: u32, points: u32) -> SliceHeap {
+        let mut heap = SliceHeap::from(&mut Source::Heap, slices, points);
+        heap.resize(slices, points);
+        heap
+    }
+
+    /// Nothing yet, with room for slices and their points.
+    pub fn from(source: &mut Source, slices: u32, points: u32) -> SliceHeap {
         SliceHeap {
-            slices: vec![Slice::default(); slices as usize],
-            neighbours: vec![Neighbours::default(); points as usize],
-            last: vec![0; points as usize],
+            slices: source.piece(u64::from(slices)),
+            neighbours: source.piece(u64::from(points)),
+            last: source.piece(u64::from(points)),
             points_used: 0,
         }
+    }
+
+    /// So many slices and points, no slice open.
+    pub fn resize(&mut self, slices: u32, points: u32) {
+        self.slices.resize_zeroed(slices as usize);
+        self.neighbours.resize_zeroed(points as usize);
+        self.last.resize_zeroed(points as usize);
+        self.points_used = 0;
     }
 
     /// Lends it to the codec.
@@ -96,8 +324,102 @@ impl SliceHeap {
 
     /// Bytes held.
     pub fn bytes(&self) -> u64 {
-        let slices = self.slices.len() * size_of::<Slice>();
-        let points = self.last.len() * (size_of::<Neighbours>() + 1);
-        (slices + points) as u64
+        self.slices.bytes() + self.neighbours.bytes() + self.last.bytes()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{Client, State};
+    use psao_core::mirror::Buffer;
+    use psao_core::stream::{self, Frame, PREAMBLE, flag, kind, write_packet};
+
+    fn lent(lines: u64) -> Source {
+        Source::Lent(Box::leak(vec![Line([0xa5; 64]); lines as usize].into()))
+    }
+
+    /// A stream of one snapshot that sets bucket 1.
+    fn stream_of(capacity: Capacity) -> Vec<u8> {
+        let header = Header {
+            capacity,
+            max_body_bytes: 4096,
+            max_raw_bytes: 4096,
+            ..Header::default()
+        };
+        let mut bytes = PREAMBLE.to_vec();
+        let mut packet = |kind, flags, sequence, body: &dyn Fn(&mut stream::Writer<'_>)| {
+            let mut out = [0; 256];
+            let length = write_packet(&mut out, kind, flags, sequence, |w| {
+                body(w);
+                Ok(())
+            });
+            bytes.extend_from_slice(&out[..length.unwrap()]);
+        };
+        packet(kind::HEADER, 0, 0, &|w| header.write(w).unwrap());
+        let frame = Frame {
+            id: 1,
+            ..Frame::default()
+        };
+        let flags = flag::SNAPSHOT | flag::LAST;
+        packet(kind::FRAME, flags, 1, &|w| frame.write(w).unwrap());
+        bytes
+    }
+
+    #[test]
+    fn a_client_in_lent_memory_follows_any_stream_within_its_limits() {
+        let capacity = |cells| Capacity {
+            instances: 3,
+            buckets: 70,
+            cells,
+        };
+        let limits = Limits {
+            capacity: capacity(1000),
+            slices: 5,
+            points: 77,
+            body_bytes: 4096,
+            raw_bytes: 4096,
+        };
+        let mut source = lent(Client::lines(limits));
+        let mut client = Client::from(&mut source, limits, 0);
+        assert!(
+            matches!(source, Source::Lent([])),
+            "measured more than it takes"
+        );
+        for cells in [900, 1000, 10] {
+            client.restart();
+            let pushed = client.push(&stream_of(capacity(cells))).unwrap();
+            assert_eq!(pushed.frame.map(|frame| frame.id), Some(1));
+            assert_eq!(client.state(), State::Live);
+            assert_eq!(client.mirror().capacity(), capacity(cells));
+            assert_eq!(client.mirror().recompute_hash(), 0);
+            // All that an upload has to fill is named.
+            let runs: Vec<_> = client.mirror().dirty_runs(Buffer::Cells).collect();
+            assert_eq!(runs, [0..cells]);
+            client.clear_dirty();
+        }
+        client.restart();
+        assert!(client.push(&stream_of(capacity(1001))).is_err());
+    }
+
+    #[test]
+    #[should_panic]
+    fn a_block_one_line_short_is_noticed() {
+        let limits = Limits {
+            body_bytes: 4096,
+            ..Limits::default()
+        };
+        let mut source = lent(Client::lines(limits) - 1);
+        Client::from(&mut source, limits, 0);
+    }
+
+    #[test]
+    fn absurd_limits_measure_as_absurd() {
+        let all = Capacity {
+            instances: u32::MAX,
+            buckets: u32::MAX,
+            cells: u32::MAX,
+        };
+        assert!(Client::lines(Limits::of_any(all)) > 1 << 32);
     }
 }
