@@ -4,9 +4,10 @@
  * A client follows one stream. It does no input or output, has no thread and no clock, and takes
  * no memory but the block that you give it:
  *
- *     psao_config config = { sizeof config };             what it may hold: the counts, or
- *     psao_config_from_stream(bytes, n, &config);         what a stream's first bytes ask for
- *     psao_client_memory_size(&config, &size, &align);    one block, yours to take and to free
+ *     psao_config config = {.struct_size = sizeof config};
+ *     config.cell_count = ...;                         what it may hold: you say it, or
+ *     psao_config_from_stream(bytes, n, &config);      a stream's first bytes
+ *     psao_client_memory_size(&config, &size, &align); one block, yours to take and to free
  *     psao_client_init(&config, memory, size, &client);
  *
  *     for each piece of the stream, until it is used up:
@@ -14,7 +15,7 @@
  *
  *     for each picture:
  *         if (psao_client_take(client, &frame) == PSAO_OK) {
- *             psao_client_dirty_ranges(...);               upload these parts of frame's buffers
+ *             psao_client_dirty_ranges(...);           upload these parts of frame's buffers
  *             psao_client_release(client);
  *         }
  *
