@@ -48,7 +48,7 @@
 #define PSAO_UPLINK_MAX_BYTES 196632
 
 /* The longest message of any other psao_uplink_ function. */
-#define PSAO_UPLINK_SMALL_BYTES 300
+#define PSAO_UPLINK_SMALL_BYTES 384
 
 /* What a function answers: 0 or more is a success, less is a failure, and what the function
  * writes is then untouched. Values are never reused; new ones may come. */
@@ -156,7 +156,7 @@ enum {
 /* Follows one stream, in memory of yours. Opaque.
  *
  * Two sides use it: the pusher (psao_client_push, psao_client_restart, psao_client_header,
- * psao_client_stats, psao_client_error_text) and the taker (psao_client_take,
+ * psao_client_topology_hash, psao_client_stats, psao_client_error_text) and the taker (psao_client_take,
  * psao_client_dirty_ranges, psao_client_lookup, psao_client_release). Each side must be one
  * thread at a time. With psao_config.two_threads both sides may run at once, and neither ever
  * waits for the other; without, they must not. psao_client_status is anyone's, at any time. */
@@ -190,10 +190,14 @@ typedef struct psao_config {
   uint32_t bucket_count;
   /* Most cells, of all instances, and one. */
   uint32_t cell_count;
-  /* Most slices. 0: as many as cells. */
+  /* Most slices. This and the next three are 0 for streams of profile cells. */
   uint32_t slice_count;
-  /* Most points of all slices. 0: seven a cell. */
+  /* Most points of slices that are open at a time. */
   uint32_t point_count;
+  /* Most patches: parts of meshes with their points. */
+  uint32_t patch_count;
+  /* Most bytes of all patches. */
+  uint32_t topology_bytes;
   /* Largest packet. 0: the format's limit, 4 MiB. */
   uint32_t max_body_bytes;
   /* Largest decompressed packet. 0: the format's limit, 4 MiB. */
@@ -266,8 +270,10 @@ typedef struct psao_stats {
   uint64_t bucket_count;
   /* Cells received. */
   uint64_t cell_count;
-  /* Slices received. */
+  /* Changes of slices received. */
   uint64_t slice_count;
+  /* Patches received. */
+  uint64_t patch_count;
 } psao_stats;
 
 /* An instance's grid and hash table, as the shaders read it. */
@@ -354,8 +360,8 @@ typedef struct psao_camera {
   float fov_y_rad;
   /* Width over height, above 0.001 and below 1000. */
   float aspect;
-  /* Zero. */
-  uint32_t reserved;
+  /* Rows of the picture: decides how fine what is far away needs to be. 0: all as fine as near. */
+  uint32_t height_px;
   /* World position. */
   double position_m[3];
   /* View direction, not zero. */
@@ -463,6 +469,16 @@ psao_result psao_client_status(const struct psao_client *client,
                                uint64_t now_ns,
                                struct psao_status *out_status);
 
+/* Reads the hash of the patches that the client has got, for psao_uplink_hello of a new
+ * connection: the server then need not send them again. 0 if some are missing. Read it before
+ * psao_client_restart, and keep the client.
+ *
+ * A recording of patches alone (psao record --topology), shipped with the app and pushed first,
+ * gives the same.
+ *
+ * Threads: pusher. No alloc, lock or log. Since ABI 1. */
+psao_result psao_client_topology_hash(const struct psao_client *client, uint64_t *out_hash);
+
 /* Reads the totals.
  *
  * Threads: pusher. No alloc, lock or log. Since ABI 1. */
@@ -552,7 +568,8 @@ const char *psao_result_str(int32_t result);
  * uplink to begin.
  *
  * config: the client's; the server refuses a scene that needs larger counts. token, token_bytes:
- * at most 256 bytes, the one that the server was started with.
+ * at most 256 bytes, the one that the server was started with. topology_hash: of
+ * psao_client_topology_hash; 0 for a new client.
  *
  * out: capacity_bytes; PSAO_UPLINK_SMALL_BYTES are enough. out_bytes: how long the message is.
  *
@@ -563,6 +580,7 @@ psao_result psao_uplink_hello(struct psao_uplink *uplink,
                               const struct psao_config *config,
                               const uint8_t *token,
                               size_t token_bytes,
+                              uint64_t topology_hash,
                               uint8_t *out,
                               size_t capacity_bytes,
                               size_t *out_bytes);

@@ -1,7 +1,7 @@
 //! Options that several commands share: which scene, how sampled, how sent.
 
 use crate::camera::CameraPath;
-use crate::encode::{Compression, Scheme};
+use crate::encode::{Compression, Limits, Scheme};
 use crate::points::SurfacePoint;
 use crate::scene::{Placement, Scene};
 use crate::server::Settings;
@@ -67,7 +67,7 @@ pub enum CompressionArg {
 pub enum ProfileArg {
     /// The paper's: whole changed cells, zstd
     Cells,
-    /// Each cell once, then occlusion alone, predicted and entropy coded
+    /// Where points are once, then occlusion alone, predicted and entropy coded
     Residual,
 }
 
@@ -99,6 +99,14 @@ pub struct StreamArgs {
     /// How hard zstd tries (profile cells)
     #[arg(long, value_enum, default_value_t = CompressionArg::Fast)]
     pub compression: CompressionArg,
+    /// Most stream bits a second, in millions (profile residual); 0 for no limit. What does not
+    /// fit waits, the largest visible error goes first
+    #[arg(long, value_name = "MBIT", default_value_t = 0.0)]
+    pub max_mbit: f64,
+    /// Instances so far away that they have more points than this a pixel get fewer (profile
+    /// residual); 0 for all points always
+    #[arg(long, value_name = "N", default_value_t = 1.0)]
+    pub points_per_pixel: f32,
     /// The extended field of view reaches this much farther on every side, degrees
     #[arg(long, value_name = "DEGREES", default_value_t = 10.0)]
     pub margin: f32,
@@ -183,6 +191,15 @@ impl StreamArgs {
         if self.step == 0 {
             return Err("--step must be 1 to 255".into());
         }
+        if !(self.max_mbit.is_finite() && self.max_mbit >= 0.0) {
+            return Err("--max-mbit must be 0 (no limit) or more".into());
+        }
+        if self.max_mbit > 0.0 && self.profile == ProfileArg::Cells {
+            return Err("--max-mbit needs --profile residual".into());
+        }
+        if !(self.points_per_pixel.is_finite() && self.points_per_pixel >= 0.0) {
+            return Err("--points-per-pixel must be 0 (all points always) or more".into());
+        }
         if !(0.0..=180.0).contains(&self.margin) {
             return Err("--margin must be 0 to 180 degrees".into());
         }
@@ -195,10 +212,17 @@ impl StreamArgs {
                         CompressionArg::Paper => Compression::Paper,
                     },
                 },
-                ProfileArg::Residual => Scheme::Residual(Quantiser {
-                    step: self.step,
-                    dead_zone: self.threshold,
-                }),
+                ProfileArg::Residual => Scheme::Residual(
+                    Quantiser {
+                        step: self.step,
+                        dead_zone: self.threshold,
+                    },
+                    Limits {
+                        max_mbit: self.max_mbit,
+                        points_per_pixel: self.points_per_pixel,
+                        ..Limits::default()
+                    },
+                ),
             },
             rate_hz: self.fps,
             margin_rad: self.margin.to_radians(),

@@ -2,7 +2,7 @@
 
 use crate::args::{SceneArgs, StreamArgs, camera_path};
 use crate::camera::Frustum;
-use crate::encode::{Encoder, capacity_of};
+use crate::encode::{Encoder, Eye, View, least_capacity};
 use crate::identity::Identity;
 use crate::server::Server;
 use crate::transport::{Transport, TransportConfig};
@@ -12,6 +12,7 @@ use glam::Vec3;
 use psao::quic::{Closed, Connect, Connection, Trust};
 use psao::{Client, ClientError, Config, State};
 use psao_core::Cell;
+use psao_core::bins::MAX_CELLS;
 use psao_core::mirror::Capacity;
 use psao_core::stream::{
     Frame, Header, MAX_BODY_BYTES, PREAMBLE, Packet, Refusal, StreamError, flag, kind,
@@ -66,7 +67,14 @@ pub struct RecordArgs {
     /// Which of the two camera paths to walk, 0 or 1; without it, everything is in view
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(0..=1))]
     pub path: Option<u32>,
+    /// Records no frames, but where all points are (profile residual): for an app to ship, so that
+    /// no session has to send it
+    #[arg(long)]
+    pub topology: bool,
 }
+
+/// Rows of the picture that a recorded camera is taken to have.
+const RECORDED_ROWS: u32 = 1080;
 
 /// Options of `psao play`.
 #[derive(Args, Clone, Debug)]
@@ -83,6 +91,9 @@ pub struct PlayArgs {
     /// Largest memory of the client's buffers, MiB
     #[arg(long, value_name = "MIB", default_value_t = 2048)]
     pub max_memory: u64,
+    /// A recording of where all points are, which the server then need not send
+    #[arg(long, value_name = "FILE.psao")]
+    pub topology: Option<PathBuf>,
     /// Stops after this many frames
     #[arg(long, value_name = "N")]
     pub frames: Option<u64>,
@@ -112,7 +123,7 @@ pub fn serve(args: &ServeArgs, out: &mut dyn Write, progress: Progress<'_>) -> R
         token: args.token.clone(),
         max_clients: args.max_clients,
         scene_hash: server.scene_hash(),
-        capacity: capacity_of(&server.world.truth),
+        capacity: least_capacity(&server.world),
     })
     .map_err(|error| error.to_string())?;
     let (address, scene_hash) = (transport.local_addr(), server.scene_hash());
@@ -155,6 +166,9 @@ pub fn record(args: &RecordArgs, progress: Progress<'_>) -> Result<u64, String> 
     if args.frames == 0 {
         return Err("--frames must be 1 or more".into());
     }
+    if args.topology && !args.stream.rest_space() {
+        return Err("--topology needs --profile residual".into());
+    }
     let error = |error: std::io::Error| {
         let out = args.out.display();
         format!("{out}: {error}: choose another place for the recording")
@@ -193,23 +207,36 @@ fn record_to(
         path.as_ref()
             .map(|path| Frustum::new(&path.at(time), settings.margin_rad))
     };
+    let mut file = BufWriter::new(file);
+    let mut encoder = Encoder::new(&world, settings.scheme, 0);
+    let scene_hash = world.scene.hash();
+    let mut bytes = encoder.header(&world, scene_hash, settings.rate_hz);
+    if args.topology {
+        encoder.all_patches(&world, &mut bytes);
+        encoder.end(&mut bytes);
+        file.write_all(&bytes).map_err(error)?;
+        finish(file, error)?;
+        return Ok(bytes.len() as u64);
+    }
     let first = view(0.0);
     let report = |done, total| progress("first occlusion", done, total);
     world.converge(&|bounds| sees(&first, bounds), world.options.rays, &report);
 
-    let mut file = BufWriter::new(file);
-    let mut encoder = Encoder::new(&world, settings.scheme);
-    let scene_hash = world.scene.hash();
-    let mut bytes = encoder.header(&world, scene_hash, settings.rate_hz);
     let mut total = 0;
     for frame in 0..args.frames {
         let time = time_of(frame);
-        let view = view(time);
-        let visible = |bounds: [Vec3; 2]| sees(&view, bounds);
+        let frustum = view(time);
+        let visible = |bounds: [Vec3; 2]| sees(&frustum, bounds);
         world.step(time, &visible, u64::MAX);
-        encoder.merge(&world.truth);
-        world.truth.clear_changes();
-        encoder.frame(&world, (time * 1e9) as u64, &visible, true, &mut bytes);
+        encoder.merge(&world);
+        world.clear_changes();
+        let view = View {
+            sees: &visible,
+            eye: path
+                .as_ref()
+                .map(|path| Eye::of(&path.at(time), RECORDED_ROWS)),
+        };
+        encoder.frame(&world, (time * 1e9) as u64, &view, true, &mut bytes);
         if frame + 1 == args.frames {
             encoder.end(&mut bytes);
         }
@@ -218,9 +245,13 @@ fn record_to(
         bytes.clear();
         progress("frames", u64::from(frame) + 1, u64::from(args.frames));
     }
-    let file = file.into_inner().map_err(|e| error(e.into_error()))?;
-    file.sync_all().map_err(error)?;
+    finish(file, error)?;
     Ok(total)
+}
+
+fn finish(file: BufWriter<File>, error: &dyn Fn(std::io::Error) -> String) -> Result<(), String> {
+    let file = file.into_inner().map_err(|e| error(e.into_error()))?;
+    file.sync_all().map_err(error)
 }
 
 fn sees(frustum: &Option<Frustum>, [min, max]: [Vec3; 2]) -> bool {
@@ -248,6 +279,10 @@ pub fn play(args: &PlayArgs) -> Result<Table, String> {
         last: Frame::default(),
         decode: Vec::new(),
     };
+    if let Some(topology) = &args.topology {
+        player.file(topology)?;
+        player.client.restart();
+    }
     match &args.fingerprint {
         None => player.file(Path::new(&args.source))?,
         Some(fingerprint) => player.live(args, *fingerprint, capacity)?,
@@ -255,21 +290,27 @@ pub fn play(args: &PlayArgs) -> Result<Table, String> {
     Ok(player.table())
 }
 
-/// Half for cells, a quarter for buckets; the rest is dirty sets and instances.
+/// A third for cells, as many points as are usual in them, and what goes with both.
 fn capacity_within(mebibytes: u64) -> Capacity {
-    let cells = (mebibytes.min(1 << 20) << 20) / 2 / size_of::<Cell>() as u64;
-    let cells = u32::try_from(cells).unwrap_or(u32::MAX);
+    let cells = (mebibytes.min(1 << 20) << 20) / 3 / size_of::<Cell>() as u64;
+    let cells = u32::try_from(cells).unwrap_or(MAX_CELLS).min(MAX_CELLS);
     Capacity {
         instances: 1 << 20,
         buckets: cells / 2,
         cells,
+        slices: cells / 8,
+        points: cells.saturating_mul(3),
+        patches: cells / 8,
+        topology_bytes: cells.saturating_mul(6),
     }
 }
 
 /// The least `--max-memory` whose [`capacity_within`] holds this.
 fn max_memory_for(needed: Capacity) -> u64 {
-    let cells = u64::from(needed.cells).max(u64::from(needed.buckets) * 2 + 1);
-    (cells * 2 * size_of::<Cell>() as u64).div_ceil(1 << 20)
+    let holds = |mebibytes: &u64| capacity_within(*mebibytes).holds(&needed);
+    let doubled = (0..21).map(|doublings| 1u64 << doublings).find(holds);
+    let most = doubled.unwrap_or(1 << 20);
+    (most / 2..=most).find(holds).unwrap_or(most)
 }
 
 fn unreadable(path: &Path, error: &std::io::Error) -> String {
@@ -330,6 +371,7 @@ impl Player {
             trust: Trust::Fingerprint(fingerprint),
             scene_hash: 0,
             capacity,
+            topology_hash: self.client.topology_hash(),
         })
         .map_err(|error| error.to_string())?;
         let mut received = Vec::new();

@@ -193,14 +193,20 @@ pub fn run(args: &DemoArgs, progress: Progress<'_>) -> Result<Figures, String> {
     };
     let mut server = Server::new(world, settings);
     let (mut transport, mut link) = connect(&server)?;
-    let id = introduce(&mut server, &mut transport, &link, &path)?;
+    let id = introduce(
+        &mut server,
+        &mut transport,
+        &link,
+        &path,
+        args.size.1 as u32,
+    )?;
 
     let samples = Samples::new(REFERENCE_RAYS);
     let mut rows = Vec::new();
     let mut shots = Vec::new();
     for frame in 0..args.frames {
         let camera = path.at(time_of(frame));
-        let said = uplink_camera(&camera, server.world.scene.origin);
+        let said = uplink_camera(&camera, server.world.scene.origin, args.size.1 as u32);
         link.connection
             .camera(&said)
             .map_err(|error| error.to_string())?;
@@ -246,7 +252,7 @@ fn is_shown(frame: u32, args: &DemoArgs) -> bool {
 fn connect(server: &Server) -> Result<(Transport, Loopback), String> {
     let identity = Identity::ephemeral().map_err(|error| error.to_string())?;
     let fingerprint = identity.fingerprint();
-    let capacity = capacity_of(&server.world.truth);
+    let capacity = capacity_of(&server.world);
     let transport = Transport::start(TransportConfig {
         listen: ([127, 0, 0, 1], 0).into(),
         identity,
@@ -263,6 +269,7 @@ fn connect(server: &Server) -> Result<(Transport, Loopback), String> {
         trust: Trust::Fingerprint(fingerprint),
         scene_hash: server.scene_hash(),
         capacity,
+        topology_hash: 0,
     })
     .map_err(|error| error.to_string())?;
     let client = Client::new(Config {
@@ -285,8 +292,9 @@ fn introduce(
     transport: &mut Transport,
     link: &Loopback,
     path: &CameraPath,
+    height_px: u32,
 ) -> Result<ClientId, String> {
-    let camera = uplink_camera(&path.at(0.0), server.world.scene.origin);
+    let camera = uplink_camera(&path.at(0.0), server.world.scene.origin, height_px);
     let deadline = Instant::now() + Duration::from_secs(10);
     while Instant::now() < deadline {
         // A camera is a datagram: it may be lost, or overtake the introduction.
@@ -356,7 +364,7 @@ impl Loopback {
             .map_err(|error| error.to_string())?;
         let waited = start.elapsed().saturating_sub(decode);
         row.ms = [report.step_ms, report.encode_ms, ms(waited), ms(decode)];
-        row.rmse_255 = server.point_rmse(id, self.client.mirror()).unwrap_or(0.0);
+        row.rmse_255 = server.point_rmse(id, &self.client).unwrap_or(0.0);
         // The next frame must not be skipped for a window that is only just emptying.
         while !transport.ready(id) {
             std::thread::yield_now();

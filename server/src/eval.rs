@@ -8,7 +8,9 @@
 use crate::args::{ProfileArg, SceneArgs, camera_path};
 use crate::camera::{CameraPath, Frustum};
 use crate::demo::parse_size;
-use crate::encode::{Compression, Encoder, Scheme, capacity_of, point_rmse};
+use crate::encode::{
+    Compression, Encoder, Eye, Limits, Scheme, View as Sight, capacity_of, point_rmse,
+};
 use crate::metrics::Pair;
 use crate::picture::write_whole;
 use crate::render::{REFERENCE_RAYS, View};
@@ -293,7 +295,10 @@ impl Bench<'_> {
         let mut world = scene.world(profile == ProfileArg::Residual, &placing)?;
         let schemes: Vec<Scheme> = match profile {
             ProfileArg::Cells => vec![CELLS],
-            ProfileArg::Residual => args.steps.iter().copied().map(Scheme::Residual).collect(),
+            ProfileArg::Residual => {
+                let scheme = |&quantiser| Scheme::Residual(quantiser, Limits::default());
+                args.steps.iter().map(scheme).collect()
+            }
         };
         bounded(&world, schemes.len())?;
         let aspect = args.size.0 as f32 / args.size.1 as f32;
@@ -314,7 +319,7 @@ impl Bench<'_> {
         for &rate_hz in &args.rates {
             // Back to the start, with all that will be seen as it is then.
             world.step(0.0, &seen, u64::MAX);
-            world.truth.clear_changes();
+            world.clear_changes();
             let name = format!("{rate_hz} Hz");
             let frames = |done, total| progress(&stage(&name), done, total);
             self.rate(&mut world, &path, rate_hz, &schemes, found, &frames)?;
@@ -342,14 +347,18 @@ impl Bench<'_> {
             let time = f64::from(frame) / rate_hz;
             let view = view(path, time);
             let visible = |[min, max]: [Vec3; 2]| view.sees_box(min, max);
+            let sight = Sight {
+                sees: &visible,
+                eye: Some(Eye::of(&path.at(time), args.size.1 as u32)),
+            };
             let start = Instant::now();
             let step = world.step(time, &visible, u64::MAX);
             step_ms.push(ms(start));
             rays.push(step.rays as f64);
             for stream in &mut streams {
-                stream.frame(world, (time * 1e9) as u64, &visible, &self.pool)?;
+                stream.frame(world, (time * 1e9) as u64, &sight, &self.pool)?;
             }
-            world.truth.clear_changes();
+            world.clear_changes();
             // The middle of each of as many equal parts of the steady frames.
             let first = left_out(args.frames, rate_hz);
             let steady = args.frames - first;
@@ -387,7 +396,7 @@ fn view(path: &CameraPath, time_s: f64) -> Frustum {
 
 /// Checks that streams side by side have room.
 fn bounded(world: &World, streams: usize) -> Result<(), String> {
-    let capacity = capacity_of(&world.truth);
+    let capacity = capacity_of(world);
     // Mirrors at both ends and what the client had before; at both ends, what the residual codec
     // keeps (at most 32 bytes a point).
     let elements = u64::from(capacity.cells) + u64::from(capacity.buckets);
@@ -433,16 +442,16 @@ struct StreamFrame {
 impl Stream {
     fn new(world: &World, scheme: Scheme, rate_hz: f64) -> Stream {
         let scene_hash = world.scene.hash();
-        let mut encoder = Encoder::new(world, scheme);
+        let mut encoder = Encoder::new(world, scheme, 0);
         let bytes = encoder.header(world, scene_hash, rate_hz as f32);
         Stream {
             scheme,
             encoder,
             client: Client::new(Config {
-                capacity: capacity_of(&world.truth),
+                capacity: capacity_of(world),
                 scene_hash,
             }),
-            before: vec![Cell::default(); world.truth.cells.len()],
+            before: vec![Cell::default(); capacity_of(world).cells as usize],
             bytes,
             frames: Vec::new(),
             squares: 0.0,
@@ -456,14 +465,14 @@ impl Stream {
         &mut self,
         world: &World,
         time_ns: u64,
-        visible: &(dyn Fn([Vec3; 2]) -> bool + Sync),
+        sight: &Sight<'_>,
         pool: &ThreadPool,
     ) -> Result<(), String> {
         let (encoder, bytes) = (&mut self.encoder, &mut self.bytes);
         let encode_ms = pool.install(|| {
             let start = Instant::now();
-            encoder.merge(&world.truth);
-            encoder.frame(world, time_ns, visible, true, bytes);
+            encoder.merge(world);
+            encoder.frame(world, time_ns, sight, true, bytes);
             ms(start)
         });
         let start = Instant::now();
@@ -502,7 +511,7 @@ impl Stream {
             slices_bytes: slices_bytes(&self.bytes).map_err(|error| error.to_string())?,
             encode_ms,
             decode_ms,
-            rmse_255: point_rmse(world, mine, visible),
+            rmse_255: point_rmse(world, mine, self.encoder.slices(), sight.sees),
             points,
         });
         self.client.clear_dirty();
@@ -545,7 +554,7 @@ impl Stream {
         Row {
             profile: match self.scheme {
                 Scheme::Cells { .. } => ProfileArg::Cells.name(),
-                Scheme::Residual(_) => ProfileArg::Residual.name(),
+                Scheme::Residual(..) => ProfileArg::Residual.name(),
             },
             quant: name_of(self.scheme),
             mbit_per_s: mean(&kbits[steady..]) * rate_hz / 1e3,
@@ -584,7 +593,7 @@ fn slices_bytes(stream: &[u8]) -> Result<usize, StreamError> {
 fn name_of(scheme: Scheme) -> String {
     match scheme {
         Scheme::Cells { threshold, .. } => format!("threshold {threshold}"),
-        Scheme::Residual(Quantiser { step, dead_zone }) => {
+        Scheme::Residual(Quantiser { step, dead_zone }, _) => {
             format!("step {step}, dead zone {dead_zone}")
         }
     }

@@ -16,6 +16,7 @@ pub mod report;
 pub mod samples;
 pub mod scene;
 pub mod server;
+pub mod topology;
 pub mod transport;
 pub mod truth;
 pub mod world;

@@ -1,8 +1,8 @@
 //! The server's frame, top to bottom: what clients say, the world's step, a frame a client.
 
 use crate::camera::{Camera, Frustum};
-use crate::encode::{Encoder, FrameStats, Scheme, point_rmse};
-use crate::transport::{ClientId, Event, OwnedMessage, Transport};
+use crate::encode::{Encoder, Eye, FrameStats, Scheme, View, point_rmse};
+use crate::transport::{ClientId, Event, OwnedMessage, Room, Transport};
 use crate::world::{StepStats, World};
 use glam::{Affine3A, DAffine3, DVec3, Vec3};
 use psao::memory::Heap;
@@ -26,6 +26,7 @@ struct Viewer {
     encoder: Encoder,
     /// Everything is seen until a camera has come.
     frustum: Option<Frustum>,
+    eye: Option<Eye>,
     acknowledged: u32,
     header_sent: bool,
 }
@@ -102,7 +103,7 @@ impl Server {
     pub fn listen(&mut self, transport: &mut Transport) {
         for event in transport.events() {
             match event {
-                Event::Joined(id) => self.join(id),
+                Event::Joined(id, room) => self.join(id, &room),
                 Event::Left(id, why) => {
                     tracing::info!("client {id:?} left: {why}");
                     self.viewers.remove(&id);
@@ -112,13 +113,18 @@ impl Server {
         }
     }
 
-    /// A client has come; it has nothing yet.
-    fn join(&mut self, id: ClientId) {
+    /// A client has come; it has nothing yet, but perhaps all patches.
+    fn join(&mut self, id: ClientId, room: &Room) {
         tracing::info!("client {id:?} joined");
-        let encoder = Encoder::new(&self.world, self.settings.scheme);
+        let mut scheme = self.settings.scheme;
+        if let Scheme::Residual(_, limits) = &mut scheme {
+            limits.fit(&room.capacity);
+        }
+        let encoder = Encoder::new(&self.world, scheme, room.topology_hash);
         let viewer = Viewer {
             encoder,
             frustum: None,
+            eye: None,
             acknowledged: 0,
             header_sent: false,
         };
@@ -131,7 +137,9 @@ impl Server {
         };
         let driven = match message {
             OwnedMessage::Camera(camera) => {
+                let height_px = camera.height_px;
                 let camera = view_of(&camera, self.world.scene.origin);
+                viewer.eye = Some(Eye::of(&camera, height_px));
                 viewer.frustum = Some(Frustum::new(&camera, self.settings.margin_rad));
                 Ok(())
             }
@@ -174,9 +182,9 @@ impl Server {
         self.time_ns = (time_s * 1e9) as u64;
         self.frames += 1;
         for viewer in self.viewers.values_mut() {
-            viewer.encoder.merge(&self.world.truth);
+            viewer.encoder.merge(&self.world);
         }
-        self.world.truth.clear_changes();
+        self.world.clear_changes();
         stats
     }
 
@@ -198,10 +206,13 @@ impl Server {
                 viewer.header_sent = true;
             }
             let frustum = viewer.frustum.clone();
-            let visible = |bounds: [Vec3; 2]| sees(&frustum, bounds);
+            let view = View {
+                sees: &|bounds| sees(&frustum, bounds),
+                eye: viewer.eye,
+            };
             let always = beat || !bytes.is_empty();
             let encoder = &mut viewer.encoder;
-            let stats = encoder.frame(&self.world, self.time_ns, &visible, always, &mut bytes);
+            let stats = encoder.frame(&self.world, self.time_ns, &view, always, &mut bytes);
             if !bytes.is_empty() {
                 frames.push((id, stats, bytes));
             }
@@ -249,12 +260,13 @@ impl Server {
         self.viewers.get(&id).map(|viewer| viewer.encoder.mirror())
     }
 
-    /// [`point_rmse`] of a client's own mirror, over what that client sees.
-    pub fn point_rmse(&self, id: ClientId, mirror: &Mirror<Heap>) -> Option<f64> {
+    /// [`point_rmse`] of what a client has, over what that client sees.
+    pub fn point_rmse(&self, id: ClientId, client: &psao::Client) -> Option<f64> {
         let viewer = self.viewers.get(&id)?;
-        Some(point_rmse(&self.world, mirror, &|bounds| {
-            viewer.sees(bounds)
-        }))
+        let residual = matches!(self.settings.scheme, Scheme::Residual(..));
+        let slices = residual.then(|| client.slices());
+        let sees = |bounds: [Vec3; 2]| viewer.sees(bounds);
+        Some(point_rmse(&self.world, client.mirror(), slices, &sees))
     }
 }
 
@@ -284,13 +296,14 @@ fn view_of(camera: &uplink::Camera, origin: DVec3) -> Camera {
     }
 }
 
-/// A camera as a client tells it.
-pub fn uplink_camera(camera: &Camera, origin: DVec3) -> uplink::Camera {
+/// A camera as a client tells it, whose picture has so many rows.
+pub fn uplink_camera(camera: &Camera, origin: DVec3, height_px: u32) -> uplink::Camera {
     uplink::Camera {
         position_m: (camera.position.as_dvec3() + origin).to_array(),
         forward: camera.forward.to_array(),
         up: camera.up.to_array(),
         fov_y_rad: camera.fov_y_rad,
         aspect: camera.aspect,
+        height_px,
     }
 }

@@ -136,11 +136,20 @@ impl std::fmt::Display for ClientId {
     }
 }
 
+/// What a client has said of itself.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Room {
+    /// Room it has: what is admitted has all that [`TransportConfig::capacity`] asks for.
+    pub capacity: Capacity,
+    /// Hash of the patches it has already, all of them; 0 for none.
+    pub topology_hash: u64,
+}
+
 /// What happened since the last look.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Event {
     /// A client was admitted, and waits for the stream from its preamble on.
-    Joined(ClientId),
+    Joined(ClientId, Room),
     /// A client is gone (why). Its last event.
     Left(ClientId, String),
     /// A client says something.
@@ -197,6 +206,7 @@ struct Clients {
 #[derive(Debug, Default)]
 struct Client {
     joined_told: bool,
+    room: Room,
     camera: Option<Camera>,
     ack: Option<u32>,
     resync: bool,
@@ -248,14 +258,18 @@ impl Shared {
             return refuse(Refusal::Scene);
         }
         let (need, have) = (self.capacity, hello.capacity);
-        if have.instances < need.instances || have.buckets < need.buckets || have.cells < need.cells
-        {
+        if !have.holds(&need) {
             let text = format!(
-                "{}: it needs {} instances, {} buckets and {} cells",
+                "{}: it needs {} instances, {} buckets, {} cells, {} slices, {} points, \
+                 {} patches and {} bytes of topology",
                 Refusal::Capacity,
                 need.instances,
                 need.buckets,
-                need.cells
+                need.cells,
+                need.slices,
+                need.points,
+                need.patches,
+                need.topology_bytes
             );
             return Err((Refusal::Capacity, text));
         }
@@ -266,7 +280,13 @@ impl Shared {
         }
         clients.last_id += 1;
         let id = ClientId(clients.last_id);
-        let client = Client::default();
+        let client = Client {
+            room: Room {
+                capacity: have,
+                topology_hash: hello.topology_hash,
+            },
+            ..Client::default()
+        };
         let wake = Arc::clone(&client.wake);
         clients.by_id.insert(id, client);
         Ok((id, wake))
@@ -339,7 +359,7 @@ impl Transport {
         self.shared.clients().by_id.retain(|&id, client| {
             if !client.joined_told {
                 client.joined_told = true;
-                events.push(Event::Joined(id));
+                events.push(Event::Joined(id, client.room));
             }
             let camera = client.camera.take().map(OwnedMessage::Camera);
             let ack = client.ack.take().map(OwnedMessage::Ack);

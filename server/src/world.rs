@@ -9,12 +9,16 @@ use crate::points::{PointError, SurfacePoint, generate, largest_radius, morton_o
 use crate::rays::{Against, CpuTracer, Deformed, TooManyTriangles, Tracer, offset_origin, reach};
 use crate::samples::{PointSamples, Samples};
 use crate::scene::{InstancePose, Mesh, Pose, Scene};
+use crate::topology::{Adjacency, PointSet, SLICE_BLOCKS, Topology};
 use crate::truth::{Place, Placement, Truth, buckets_for, choose_buckets, fit};
 use glam::{Affine3A, DAffine3, Vec3, Vec3A};
+use psao_core::residual::BLOCK;
+use psao_core::topology::LEVELS;
 use psao_core::{Instance, Kernel};
 use rayon::prelude::*;
 use std::collections::{BTreeMap, HashSet};
 use std::ops::Range;
+use std::sync::Arc;
 
 /// Points of a slice: the unit of visibility and of tracing.
 pub const SLICE_POINTS: usize = 1024;
@@ -39,8 +43,9 @@ pub struct Options {
     pub cell_over_radius: f32,
     /// Seed of the point placement.
     pub seed: u64,
-    /// Points of deforming instances keep their cells in rest space, as profile `residual` needs
-    /// it; else they move through the cells of the posed local space, as in the paper.
+    /// Points are laid out for profile `residual`: in rest space, a mesh's for all its instances
+    /// ([`Topology`]). Else each instance has its own in cells ([`Truth`]), and those of deforming
+    /// instances move through the cells of the posed local space, as in the paper.
     pub rest_space: bool,
 }
 
@@ -119,8 +124,11 @@ pub struct Slice {
     pub instance: u32,
     /// Numbers of its points.
     pub points: Range<u32>,
-    /// Cells that its points opened; empty for deforming instances, whose cells come and go.
+    /// Cells that its points opened; empty in rest space, and for deforming instances, whose
+    /// cells come and go.
     pub cells: Range<u32>,
+    /// In rest space its patch.
+    pub patch: u32,
     /// World bounds now, with a cell's margin.
     pub bounds: [Vec3; 2],
     /// Bounds in local space, for rigid instances.
@@ -166,8 +174,10 @@ pub struct World {
     pub options: Options,
     /// Where everything is.
     pub pose: Pose,
-    /// Buckets and cells.
+    /// Instances' grids; and, unless [`Options::rest_space`], buckets and cells.
     pub truth: Truth,
+    /// With [`Options::rest_space`], points a mesh.
+    pub topology: Topology,
     /// All slices, instance by instance.
     pub slices: Vec<Slice>,
     /// Cells from here on belong to deforming instances, in no order.
@@ -181,8 +191,15 @@ pub struct World {
     samples: Samples,
     carriers: Vec<Option<Carrier>>,
     points: Vec<SurfacePoint>,
+    /// Where points are in the truth's cells; empty in rest space.
     places: Vec<Place>,
+    /// In rest space, the highest level of detail that has a point.
+    levels: Vec<u8>,
     occlusion: Vec<u8>,
+    /// In rest space, slices in which a point's occlusion has changed since
+    /// [`World::clear_changes`].
+    changed: Vec<bool>,
+    openness: Vec<Option<Openness>>,
     /// Rays against what each point is attached to: bits of those that hit.
     fixed: Vec<u64>,
     moves: Vec<bool>,
@@ -222,7 +239,7 @@ impl World {
         deform(&scene, &pose, &mut deformed);
         let tracer =
             CpuTracer::new(&scene, &pose, &deformed, &moves).map_err(WorldError::Triangles)?;
-        let placed = place_points(&scene, &pose, &deformed, &options, progress)?;
+        let sets = place_points(&scene, &pose, &deformed, &options, progress)?;
 
         let mut world = World {
             samples: Samples::new(options.rays),
@@ -235,7 +252,11 @@ impl World {
             carriers: vec![None; scene.instances.len()],
             points: Vec::new(),
             places: Vec::new(),
+            levels: Vec::new(),
             occlusion: Vec::new(),
+            changed: Vec::new(),
+            openness: Vec::new(),
+            topology: Topology::default(),
             fixed: Vec::new(),
             swept: vec![[[Vec3::ZERO; 2]; 2]; scene.instances.len()],
             driven: BTreeMap::new(),
@@ -247,13 +268,121 @@ impl World {
             pose,
             deformed,
         };
-        world.build_cells(placed, progress);
+        if world.options.rest_space {
+            world.build_topology(sets, progress);
+        } else {
+            world.build_cells(sets, progress);
+        }
+        world.occlusion = vec![255; world.points.len()];
+        world.fixed = vec![0; world.points.len() * world.words()];
+        for slice in 0..world.slices.len() {
+            world.slices[slice].bounds = world.slice_bounds(slice);
+        }
         world.sweep();
         world.sweep();
         Ok(world)
     }
 
-    fn build_cells(&mut self, placed: Vec<Placed>, progress: Progress<'_>) {
+    fn build_topology(&mut self, sets: Vec<Sampled>, progress: Progress<'_>) {
+        let total = sets.len() as u64;
+        let done = std::sync::atomic::AtomicU64::new(0);
+        let mut of_instance = vec![None; self.scene.instances.len()];
+        let made: Vec<Option<PointSet>> = sets
+            .par_iter()
+            .map(|sampled| {
+                let mesh = &self.scene.meshes[sampled.mesh as usize];
+                let positions = sampled.points.iter();
+                let bounds =
+                    bounds_of(positions.map(|p| p.position(&mesh.triangles, &mesh.positions)));
+                let (cell_m, radius) = (self.options.cell_m(), 1.0 / self.options.cell_over_radius);
+                let grid = fit(bounds, sampled.scale, cell_m, radius)?;
+                let set = PointSet::new(mesh, &sampled.points, &grid);
+                let so_far = done.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
+                progress("topology", so_far + 1, total);
+                set
+            })
+            .collect();
+        let mut kept = Vec::new();
+        for (sampled, set) in sets.iter().zip(made) {
+            let Some(set) = set else { continue };
+            for &(instance, scale) in &sampled.users {
+                let share = sampled.share(scale);
+                // The fewest that are not much fewer than asked for.
+                let level =
+                    (1..LEVELS).take_while(|level| 0.5f32.powi(*level as i32) > 0.75 * share);
+                of_instance[instance as usize] = Some((kept.len() as u32, level.count() as u32));
+            }
+            kept.push(set);
+        }
+        self.topology = Topology::new(kept, of_instance);
+        let mut instances = vec![Instance::default(); self.scene.instances.len()];
+        let mut buckets = 0;
+        for (instance, grid) in instances.iter_mut().enumerate() {
+            let Some((set, level)) = self.topology.of_instance[instance] else {
+                continue;
+            };
+            *grid = self.topology.sets[set as usize].levels[level as usize].grid;
+            grid.bucket_first = buckets;
+            buckets += grid.bucket_count;
+        }
+        self.truth = Truth::new(instances, 0);
+        for instance in 0..self.scene.instances.len() as u32 {
+            self.add_patches(instance);
+        }
+        self.changed = vec![true; self.slices.len()];
+        let of_instance = &self.topology.of_instance;
+        let mut adjacent: BTreeMap<(u32, u32), Arc<Adjacency>> = BTreeMap::new();
+        for key in of_instance.iter().flatten() {
+            adjacent.entry(*key).or_insert_with(|| {
+                let set = &self.topology.sets[key.0 as usize];
+                Arc::new(Adjacency::new(set, key.1))
+            });
+        }
+        self.openness = of_instance
+            .iter()
+            .map(|key| key.map(|key| Openness::new(Arc::clone(&adjacent[&key]))))
+            .collect();
+    }
+
+    /// An instance's slices: the patches of its set, with the points of its level.
+    fn add_patches(&mut self, instance: u32) {
+        let Some((set_index, level)) = self.topology.of_instance[instance as usize] else {
+            return;
+        };
+        let first = self.points.len() as u32;
+        let first_slice = self.slices.len() as u32;
+        let set = &self.topology.sets[set_index as usize];
+        for patch in 0..set.patches.len() {
+            let slice_first = self.points.len() as u32;
+            for point in set.patch_range(patch) {
+                let coded = &set.coded[point];
+                if u32::from(coded.level) >= level {
+                    self.points.push(set.points[point]);
+                    self.levels.push(coded.level);
+                }
+            }
+            self.slices.push(Slice {
+                instance,
+                points: slice_first..self.points.len() as u32,
+                cells: 0..0,
+                patch: self.topology.first_patch[set_index as usize] + patch as u32,
+                bounds: [Vec3::ZERO; 2],
+                local_bounds: [Vec3::ZERO; 2],
+                rays_done: 0,
+                stale: true,
+            });
+        }
+        self.carriers[instance as usize] = Some(Carrier {
+            points: first..self.points.len() as u32,
+            slices: first_slice..self.slices.len() as u32,
+            loose: false,
+            unplaced: false,
+        });
+        self.bound_slices(instance, first_slice);
+    }
+
+    fn build_cells(&mut self, sets: Vec<Sampled>, progress: Progress<'_>) {
+        let placed = place_instances(&self.scene, &self.pose, &self.deformed, &self.options, sets);
         let total: usize = placed.iter().map(|p| p.points.len()).sum();
         let mut instances = vec![Instance::default(); self.scene.instances.len()];
         let (mut buckets, mut cells) = (0, 0);
@@ -286,11 +415,6 @@ impl World {
         if !placed.iter().any(|p| p.loose) {
             self.loose_cells = self.truth.next_cell();
         }
-        self.occlusion = vec![255; self.points.len()];
-        self.fixed = vec![0; self.points.len() * self.words()];
-        for slice in 0..self.slices.len() {
-            self.slices[slice].bounds = self.slice_bounds(slice);
-        }
     }
 
     fn add_carrier(&mut self, placed: &Placed) {
@@ -317,6 +441,7 @@ impl World {
                 instance: placed.instance,
                 points: slice_first..self.points.len() as u32,
                 cells: if placed.loose { 0..0 } else { cells },
+                patch: 0,
                 bounds: [Vec3::ZERO; 2],
                 local_bounds: [Vec3::ZERO; 2],
                 rays_done: 0,
@@ -329,12 +454,17 @@ impl World {
             loose: placed.loose,
             unplaced: false,
         });
-        if !self.scene.instances[placed.instance as usize].deforms {
+        self.bound_slices(placed.instance, first_slice);
+    }
+
+    /// Local bounds of a rigid instance's slices.
+    fn bound_slices(&mut self, instance: u32, first_slice: u32) {
+        if !self.scene.instances[instance as usize].deforms {
             for slice in first_slice as usize..self.slices.len() {
                 let range = self.slices[slice].points.clone();
-                let positions = &self.mesh(placed.instance).positions;
+                let positions = &self.mesh(instance).positions;
                 self.slices[slice].local_bounds =
-                    bounds_of(self.local_positions(placed.instance, range, positions));
+                    bounds_of(self.local_positions(instance, range, positions));
             }
         }
     }
@@ -630,11 +760,18 @@ impl World {
             stats.points += traced.points;
             let bits = first * words..first * words + traced.fixed.len();
             self.fixed[bits].copy_from_slice(&traced.fixed);
+            let mut changed = false;
             for (point, &occlusion) in (first..).zip(&traced.occlusion) {
                 if self.occlusion[point] != occlusion {
                     self.occlusion[point] = occlusion;
-                    self.truth.set_occlusion(self.places[point], occlusion);
+                    if let Some(place) = self.places.get(point) {
+                        self.truth.set_occlusion(*place, occlusion);
+                    }
+                    changed = true;
                 }
+            }
+            if changed && self.options.rest_space {
+                self.note_change(index);
             }
         }
         stats
@@ -782,12 +919,105 @@ impl World {
         self.points.len()
     }
 
+    /// In rest space, the highest level of detail that has each point of a slice.
+    pub fn levels(&self, slice: &Slice) -> &[u8] {
+        &self.levels[slice.points.start as usize..slice.points.end as usize]
+    }
+
+    /// A point's position and normal in the space that its instance's grid is in.
+    pub fn grid_point(&self, instance: u32, number: u32) -> (Vec3, Vec3) {
+        let (positions, normals) = self.grid_vertices(instance);
+        let point = &self.points[number as usize];
+        let triangles = &self.mesh(instance).triangles;
+        (
+            point.position(triangles, positions),
+            point.normal(triangles, positions, normals),
+        )
+    }
+
+    /// In rest space: the level of detail that an instance's scale asks for, if it has points.
+    pub fn level_of(&self, instance: u32) -> Option<u32> {
+        self.topology.of_instance[instance as usize].map(|(_, level)| level)
+    }
+
+    /// In rest space: an instance's grid at a level of detail, not below [`World::level_of`].
+    pub fn grid(&self, instance: u32, level: u32) -> Instance {
+        let own = self.truth.instances[instance as usize];
+        let Some(set) = self.topology.set_of(instance) else {
+            return own;
+        };
+        Instance {
+            bucket_first: own.bucket_first,
+            ..set.levels[level as usize].grid
+        }
+    }
+
+    /// Numbers of an instance's slices.
+    pub fn slices_of(&self, instance: u32) -> Range<u32> {
+        let carrier = self.carriers[instance as usize].as_ref();
+        carrier.map_or(0..0, |carrier| carrier.slices.clone())
+    }
+
+    /// In rest space: whether a slice's occlusion has changed since [`World::clear_changes`].
+    pub fn has_changed(&self, slice: usize) -> bool {
+        self.changed[slice]
+    }
+
+    /// Starts a new frame for [`World::has_changed`] and [`Truth::changes`].
+    pub fn clear_changes(&mut self) {
+        self.changed.fill(false);
+        self.truth.clear_changes();
+    }
+
+    /// In rest space: the blocks of a slice (of [`psao_core::residual::BLOCK`] points) that a
+    /// client needs, the first in the lowest bit. In the others, and in all cells around them,
+    /// every point is as good as open.
+    pub fn shown(&self, slice: &Slice) -> u64 {
+        let Some(openness) = &self.openness[slice.instance as usize] else {
+            return 0;
+        };
+        let set = self.topology.of_instance[slice.instance as usize].map_or(0, |(set, _)| set);
+        let patch = slice.patch - self.topology.first_patch[set as usize];
+        let first = patch as usize * SLICE_BLOCKS;
+        let near = openness.near_dark[first..first + SLICE_BLOCKS].iter();
+        near.rev()
+            .fold(0, |shown, &dark| shown << 1 | u64::from(dark > 0))
+    }
+
+    fn note_change(&mut self, index: usize) {
+        self.changed[index] = true;
+        let slice = &self.slices[index];
+        let set = self.topology.of_instance[slice.instance as usize].map_or(0, |(set, _)| set);
+        let patch = slice.patch - self.topology.first_patch[set as usize];
+        let points = slice.points.start as usize..slice.points.end as usize;
+        let Some(openness) = &mut self.openness[slice.instance as usize] else {
+            return;
+        };
+        let blocks = self.occlusion[points].chunks(BLOCK);
+        for (block, occlusion) in (patch as usize * SLICE_BLOCKS..).zip(blocks) {
+            let least = occlusion.iter().copied().min().unwrap_or(255);
+            openness.set(block, least);
+        }
+        // What comes into or goes out of cells nearby is a change of those slices too.
+        let carrier = self.carriers[slice.instance as usize].as_ref();
+        let first_slice = carrier.map_or(0, |carrier| carrier.slices.start as usize);
+        for patch in openness.turned.drain(..) {
+            self.changed[first_slice + patch as usize] = true;
+        }
+    }
+
     /// Points that found no room in their cell or bucket.
     pub fn discarded(&self) -> usize {
-        self.places
-            .iter()
-            .filter(|&&place| place == Place::NONE)
-            .count()
+        let of_instance = self.topology.of_instance.iter().flatten();
+        let in_sets = of_instance
+            .map(|&(set, level)| self.topology.sets[set as usize].levels[level as usize].discarded);
+        let in_sets: usize = in_sets.sum();
+        in_sets
+            + self
+                .places
+                .iter()
+                .filter(|&&place| place == Place::NONE)
+                .count()
     }
 
     fn words(&self) -> usize {
@@ -824,6 +1054,50 @@ impl World {
         let [min, max] = placed_bounds(world, local);
         let margin = self.options.cell_m();
         [min - margin, max + margin]
+    }
+}
+
+/// A point as open as this, with all around it so too, need not be at the client.
+const OPEN: u8 = 250;
+
+/// Which blocks of an instance's points have dark ones, or are near such.
+#[derive(Clone, Debug)]
+struct Openness {
+    adjacency: Arc<Adjacency>,
+    dark: Vec<bool>,
+    /// How many dark blocks are near each, itself counted.
+    near_dark: Vec<u16>,
+    /// Patches with blocks that came near a dark one, or no longer are.
+    turned: Vec<u32>,
+}
+
+impl Openness {
+    fn new(adjacency: Arc<Adjacency>) -> Openness {
+        let blocks = adjacency.blocks();
+        Openness {
+            adjacency,
+            dark: vec![false; blocks],
+            near_dark: vec![0; blocks],
+            turned: Vec::new(),
+        }
+    }
+
+    fn set(&mut self, block: usize, least: u8) {
+        // A little apart, so that what wavers does not come and go.
+        let dark = least < if self.dark[block] { OPEN + 3 } else { OPEN };
+        if dark == self.dark[block] {
+            return;
+        }
+        self.dark[block] = dark;
+        for &near in self.adjacency.near(block) {
+            let count = &mut self.near_dark[near as usize];
+            let before = *count > 0;
+            *count = if dark { *count + 1 } else { *count - 1 };
+            let patch = near / SLICE_BLOCKS as u32;
+            if before != (*count > 0) && self.turned.last() != Some(&patch) {
+                self.turned.push(patch);
+            }
+        }
     }
 }
 
@@ -955,14 +1229,32 @@ struct Placed {
     cells: usize,
 }
 
-/// Paper, 3.1 and 3.2: points a mesh, then each instance's own prefix of them in Morton order.
+/// The points of a mesh, for instances whose scales have the same ratios.
+struct Sampled {
+    mesh: u32,
+    /// Instances and their scales, local units to metres.
+    users: Vec<(u32, Vec3)>,
+    /// The largest of these.
+    scale: Vec3,
+    /// In progressive order, as many as the largest needs.
+    points: Vec<SurfacePoint>,
+}
+
+impl Sampled {
+    /// The part of the points that a user of this scale needs.
+    fn share(&self, scale: Vec3) -> f32 {
+        (scale / self.scale).powf(2.0).element_sum() / 3.0
+    }
+}
+
+/// Paper, 3.1: points a mesh.
 fn place_points(
     scene: &Scene,
     pose: &Pose,
     deformed: &[Deformed],
     options: &Options,
     progress: Progress<'_>,
-) -> Result<Vec<Placed>, WorldError> {
+) -> Result<Vec<Sampled>, WorldError> {
     // Instances share points if their mesh is the same and scaled by the same ratios.
     let mut sets: BTreeMap<(u32, [i32; 2]), Vec<(u32, Vec3)>> = BTreeMap::new();
     for (index, instance) in scene.instances.iter().enumerate() {
@@ -1005,10 +1297,10 @@ fn place_points(
     sets.sort_by_key(|((mesh, _), _)| {
         std::cmp::Reverse(scene.meshes[*mesh as usize].triangles.len())
     });
-    let placed: Vec<Vec<Placed>> = sets
-        .par_iter()
+    let mut sampled: Vec<Sampled> = sets
+        .into_par_iter()
         .map(|((mesh_index, _), users)| {
-            let mesh = &scene.meshes[*mesh_index as usize];
+            let mesh = &scene.meshes[mesh_index as usize];
             let volume = |s: &Vec3| s.x * s.y * s.z;
             let largest = users.iter().map(|(_, s)| *s).fold(Vec3::ZERO, |a, b| {
                 if volume(&b) > volume(&a) { b } else { a }
@@ -1017,37 +1309,50 @@ fn place_points(
                 mesh,
                 largest,
                 options.density,
-                options.seed.wrapping_add(u64::from(*mesh_index)),
+                options.seed.wrapping_add(u64::from(mesh_index)),
             )?;
-            let placed = users
-                .par_iter()
-                .filter_map(|&(instance, scale)| {
-                    let share = (scale / largest).powf(2.0).element_sum() / 3.0;
-                    let count = (set.points.len() as f32 * share).round() as usize;
-                    let points = &set.points[..count
-                        .clamp(1, set.points.len().max(1))
-                        .min(set.points.len())];
-                    // Rest space is as large as the pose makes it; local space as placed.
-                    let deforms = scene.instances[instance as usize].deforms;
-                    let scale = if deforms && !options.rest_space {
-                        scale_of(&pose.instances[instance as usize].world_from_local)
-                    } else {
-                        scale
-                    };
-                    place_instance(scene, deformed, options, instance, scale, points)
-                })
-                .collect();
             progress(
                 "points",
                 done.fetch_add(1, std::sync::atomic::Ordering::Relaxed) + 1,
                 total,
             );
-            Ok(placed)
+            Ok(Sampled {
+                mesh: mesh_index,
+                users,
+                scale: largest,
+                points: set.points,
+            })
         })
         .collect::<Result<_, PointError>>()?;
-    let mut placed: Vec<Placed> = placed.into_iter().flatten().collect();
+    sampled.sort_by_key(|sampled| sampled.users[0].0);
+    Ok(sampled)
+}
+
+/// Paper, 3.2: each instance's own prefix of its mesh's points, in Morton order.
+fn place_instances(
+    scene: &Scene,
+    pose: &Pose,
+    deformed: &[Deformed],
+    options: &Options,
+    sets: Vec<Sampled>,
+) -> Vec<Placed> {
+    let placed = sets.par_iter().flat_map(|set| {
+        set.users.par_iter().filter_map(|&(instance, scale)| {
+            let count = (set.points.len() as f32 * set.share(scale)).round() as usize;
+            let most = set.points.len();
+            let points = &set.points[..count.clamp(1, most.max(1)).min(most)];
+            // Local space is as large as placed, whatever the pose makes of it.
+            let scale = if scene.instances[instance as usize].deforms {
+                scale_of(&pose.instances[instance as usize].world_from_local)
+            } else {
+                scale
+            };
+            place_instance(scene, deformed, options, instance, scale, points)
+        })
+    });
+    let mut placed: Vec<Placed> = placed.collect();
     placed.sort_by_key(|p| p.instance);
-    Ok(placed)
+    placed
 }
 
 /// One instance's points in Morton order, quantised in its own grid.
@@ -1059,7 +1364,7 @@ fn place_instance(
     scale: Vec3,
     points: &[SurfacePoint],
 ) -> Option<Placed> {
-    let loose = scene.instances[instance as usize].deforms && !options.rest_space;
+    let loose = scene.instances[instance as usize].deforms;
     let mesh = &scene.meshes[scene.instances[instance as usize].mesh as usize];
     let (positions, normals) = match deformed.iter().find(|d| loose && d.instance == instance) {
         Some(d) => (&d.positions, &d.normals),

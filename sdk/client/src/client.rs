@@ -1,9 +1,9 @@
 //! The client's side of a stream: packets in, frames out.
 
-use crate::memory::{Heap, Limits, Piece, SliceHeap, Source, capacity_fits};
+use crate::memory::{Heap, Limits, Piece, SliceHeap, Source};
 use psao_core::Mirror;
 use psao_core::mirror::Capacity;
-use psao_core::slices::apply_slices;
+use psao_core::slices::{apply_instances, apply_patches, apply_slices};
 use psao_core::stream::{
     CHANGES_HEADER_BYTES, FRAME_HEADER_BYTES, Frame, Header, MAX_BODY_BYTES, PACKET_HEADER_BYTES,
     PREAMBLE, Packet, Profile, Reader, Refusal, StreamError, apply_changes, flag, kind,
@@ -12,8 +12,7 @@ use psao_core::stream::{
 /// What a client may use at most.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Config {
-    /// Largest mirror; a stream that needs more is refused before memory is taken. Profile
-    /// `residual` takes at most 65 bytes a cell besides, for the codec's state.
+    /// Most room of each kind; a stream that needs more is refused before memory is taken.
     pub capacity: Capacity,
     /// Hash of the client's scene; 0 accepts any.
     pub scene_hash: u64,
@@ -50,14 +49,20 @@ impl std::fmt::Display for ClientError {
             ClientError::Stream(error) => write!(f, "{error}"),
             ClientError::Capacity(needed) => write!(
                 f,
-                "the scene needs {} instances, {} buckets and {} cells: raise Config::capacity",
-                needed.instances, needed.buckets, needed.cells
+                "the scene needs {} instances, {} buckets, {} cells, {} slices, {} points, \
+                 {} patches and {} bytes of topology: raise Config::capacity",
+                needed.instances,
+                needed.buckets,
+                needed.cells,
+                needed.slices,
+                needed.points,
+                needed.patches,
+                needed.topology_bytes
             ),
             ClientError::Limits(needed) => write!(
                 f,
-                "the stream needs {} slices, {} points, packets of {} bytes and contents of {}: \
-                 lend more memory",
-                needed.slices, needed.points, needed.body_bytes, needed.raw_bytes
+                "the stream needs packets of {} bytes and contents of {}: lend more memory",
+                needed.body_bytes, needed.raw_bytes
             ),
             ClientError::Scene(hash) => write!(
                 f,
@@ -114,8 +119,10 @@ pub struct Stats {
     pub buckets: u64,
     /// Cells set.
     pub cells: u64,
-    /// Slices decoded (profile `residual`).
+    /// Items of slices applied (profile `residual`).
     pub slices: u64,
+    /// Patches that came (profile `residual`).
+    pub patches: u64,
 }
 
 /// Largest packet body before the header says what this stream's is.
@@ -146,6 +153,10 @@ struct Decoder {
     header: Option<Header>,
     mirror: Mirror<Heap>,
     slices: SliceHeap,
+    /// What mirror and slices have their present lengths for.
+    room: Capacity,
+    /// Of the patches that have come.
+    topology_hash: u64,
     /// Decompressed content of a packet.
     raw: Piece<u8>,
     zstd: Piece<u64>,
@@ -189,7 +200,9 @@ impl Client {
                 state: State::Connecting,
                 header: None,
                 mirror: Mirror::new(Heap::from(source, limits.capacity)),
-                slices: SliceHeap::from(source, limits.slices, limits.points),
+                slices: SliceHeap::from(source, limits.capacity),
+                room: Capacity::default(),
+                topology_hash: 0,
                 raw: source.piece(u64::from(limits.raw_bytes)),
                 zstd: source.piece(psao_zstd::state_words() as u64),
                 next_sequence: 0,
@@ -315,6 +328,22 @@ impl Client {
         self.decoder.stats.frames > 0 && !self.decoder.partial
     }
 
+    /// What profile `residual` keeps beside the mirror.
+    pub fn slices(&self) -> &SliceHeap {
+        &self.decoder.slices
+    }
+
+    /// What to say in a hello ([`psao_core::uplink::Hello::topology_hash`]) so that no patch is
+    /// sent again: the hash of the patches that this client has got, in an earlier stream or from
+    /// a recording, if it has all of them; else 0.
+    pub fn topology_hash(&self) -> u64 {
+        if self.decoder.slices.has_all_patches() {
+            self.decoder.topology_hash
+        } else {
+            0
+        }
+    }
+
     /// What changed has been uploaded.
     pub fn clear_dirty(&mut self) {
         self.decoder.mirror.clear_dirty();
@@ -394,7 +423,7 @@ impl Decoder {
         self.next_sequence = packet.sequence.wrapping_add(1);
         match packet.kind {
             kind::FRAME | kind::SLICES => packet.check_flags(flag::SNAPSHOT | flag::LAST)?,
-            kind::HEADER | kind::END | kind::REFUSE => packet.check_flags(0)?,
+            kind::HEADER | kind::END | kind::REFUSE | kind::PATCHES => packet.check_flags(0)?,
             _ => {}
         }
         match (packet.kind, self.header) {
@@ -402,6 +431,11 @@ impl Decoder {
             (kind::FRAME, Some(header)) => self.frame(&header, packet),
             (kind::SLICES, Some(header)) if header.profile == Profile::Residual => {
                 self.frame(&header, packet)
+            }
+            (kind::PATCHES, Some(header)) if header.profile == Profile::Residual => {
+                let count = apply_patches(packet.body, &mut self.slices.slices())?;
+                self.stats.patches += u64::from(count);
+                Ok(None)
             }
             (kind::END, Some(_)) if self.open_frame.is_none() => {
                 if !packet.body.is_empty() {
@@ -417,9 +451,7 @@ impl Decoder {
                 let printable = text.chars().filter(|c| !c.is_control());
                 Err(ClientError::Refused(refusal, printable.take(200).collect()))
             }
-            (kind::HEADER | kind::FRAME | kind::END | kind::REFUSE | kind::SLICES, _) => {
-                Err(StreamError::Order.into())
-            }
+            (kind::HEADER..=kind::PATCHES, _) => Err(StreamError::Order.into()),
             (_, None) => Err(StreamError::Order.into()),
             _ if packet.flags & flag::OPTIONAL != 0 => Ok(None),
             (other, _) => Err(StreamError::Kind(other).into()),
@@ -428,7 +460,7 @@ impl Decoder {
 
     fn begin(&mut self, header: Header) -> Result<(), ClientError> {
         let need = Limits::of(&header);
-        if !capacity_fits(need.capacity, self.limits.capacity) {
+        if !self.limits.capacity.holds(&need.capacity) {
             return Err(ClientError::Capacity(need.capacity));
         }
         if !need.fit(&self.limits) {
@@ -437,13 +469,20 @@ impl Decoder {
         if self.scene_hash != 0 && self.scene_hash != header.scene_hash {
             return Err(ClientError::Scene(header.scene_hash));
         }
-        if self.mirror.capacity() != need.capacity {
+        if self.room != need.capacity {
             let empty = Mirror::new(Heap::default());
             let mut memory = std::mem::replace(&mut self.mirror, empty).into_memory();
             memory.resize_changed(need.capacity);
             self.mirror = Mirror::new(memory);
+            self.slices.resize(need.capacity);
+            self.room = need.capacity;
+        } else {
+            self.slices.slices().reset(need.capacity.cells);
+            if header.topology_hash == 0 || header.topology_hash != self.topology_hash {
+                self.slices.slices().forget_patches();
+            }
         }
-        self.slices.resize(need.slices, need.points);
+        self.topology_hash = header.topology_hash;
         self.raw.resize_zeroed(need.raw_bytes as usize);
         self.header = Some(header);
         self.partial = true;
@@ -473,7 +512,7 @@ impl Decoder {
         self.open_frame = (!last).then_some((frame.id, frame.time_ns));
         if snapshot {
             self.mirror.reset();
-            self.slices.slices().reset();
+            self.slices.slices().reset(header.capacity.cells);
             self.in_snapshot = true;
         } else if self.state == State::Desynchronised && !self.in_snapshot {
             return Ok(None);
@@ -491,7 +530,14 @@ impl Decoder {
             let room = &mut self.raw[..raw_bytes];
             psao_zstd::decompress(&mut self.zstd, room, compressed)
                 .map_err(|_| ClientError::Compression)?;
-            let changes = apply_changes(&self.raw[..raw_bytes], &mut self.mirror)?;
+            let raw = &self.raw[..raw_bytes];
+            let changes = match header.profile {
+                Profile::Cells => apply_changes(raw, &mut self.mirror)?,
+                Profile::Residual => {
+                    let slices = self.slices.slices();
+                    apply_instances(raw, &mut self.mirror, &slices)?
+                }
+            };
             self.stats.instances += u64::from(changes.instances);
             self.stats.buckets += u64::from(changes.buckets);
             self.stats.cells += u64::from(changes.cells);

@@ -5,11 +5,13 @@
 //! pieces measures the block, cuts it up and takes the heap's share.
 
 use bytemuck::{Pod, Zeroable};
+use psao_core::bins::Place;
 use psao_core::mirror::{Capacity, Memory, Parts, PartsMut};
 use psao_core::residual::Neighbours;
-use psao_core::slices::{Slice, Slices};
+use psao_core::slices::{Patch, Slice, Slices};
 use psao_core::stream::{Header, MAX_BODY_BYTES, MAX_RAW_BYTES};
-use psao_core::{Bucket, Cell, Instance};
+use psao_core::topology::{PATCH_POINTS, PatchPoint};
+use psao_core::{Bucket, Cell, Instance, dirty};
 use std::ops::{Deref, DerefMut};
 
 /// 64 bytes, a cache line: what lent memory is made of. Every piece begins with one.
@@ -20,12 +22,8 @@ pub struct Line(pub [u8; 64]);
 /// The most that a stream may ask a client to keep.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Limits {
-    /// Largest mirror.
+    /// Most room of each kind.
     pub capacity: Capacity,
-    /// Most slices (profile `residual`).
-    pub slices: u32,
-    /// Most points of all slices (profile `residual`).
-    pub points: u32,
     /// Largest packet body, bytes.
     pub body_bytes: u32,
     /// Largest decompressed content of a packet, bytes.
@@ -33,12 +31,10 @@ pub struct Limits {
 }
 
 impl Limits {
-    /// What any stream with a mirror of at most this capacity needs.
+    /// What any stream of at most this capacity needs.
     pub fn of_any(capacity: Capacity) -> Limits {
         Limits {
             capacity,
-            slices: u32::MAX,
-            points: u32::MAX,
             body_bytes: MAX_BODY_BYTES,
             raw_bytes: MAX_RAW_BYTES,
         }
@@ -48,8 +44,6 @@ impl Limits {
     pub fn of(header: &Header) -> Limits {
         Limits {
             capacity: header.capacity,
-            slices: header.slices,
-            points: header.points,
             body_bytes: header.max_body_bytes,
             raw_bytes: header.max_raw_bytes,
         }
@@ -57,17 +51,10 @@ impl Limits {
 
     /// Nothing in `self` is more than in `most`.
     pub fn fit(&self, most: &Limits) -> bool {
-        capacity_fits(self.capacity, most.capacity)
-            && self.slices <= most.slices
-            && self.points <= most.points
+        most.capacity.holds(&self.capacity)
             && self.body_bytes <= most.body_bytes
             && self.raw_bytes <= most.raw_bytes
     }
-}
-
-/// A mirror of one capacity has room in that of another.
-pub fn capacity_fits(need: Capacity, most: Capacity) -> bool {
-    need.instances <= most.instances && need.buckets <= most.buckets && need.cells <= most.cells
 }
 
 /// Where pieces come from.
@@ -92,7 +79,7 @@ impl Source {
             .div_ceil(size_of::<Line>() as u64);
         match self {
             Source::Heap => Piece {
-                memory: Place::Heap(Vec::new()),
+                memory: Store::Heap(Vec::new()),
                 length: 0,
             },
             Source::Measure(total) => {
@@ -106,7 +93,7 @@ impl Source {
                 let whole = bytes.len() / size_of::<T>() * size_of::<T>();
                 let elements = bytemuck::cast_slice_mut(&mut bytes[..whole]);
                 Piece {
-                    memory: Place::Lent(elements),
+                    memory: Store::Lent(elements),
                     length: 0,
                 }
             }
@@ -117,12 +104,12 @@ impl Source {
 /// A list of elements, from the heap or lent.
 #[derive(Debug)]
 pub struct Piece<T: 'static> {
-    memory: Place<T>,
+    memory: Store<T>,
     length: usize,
 }
 
 #[derive(Debug)]
-enum Place<T: 'static> {
+enum Store<T: 'static> {
     Heap(Vec<T>),
     Lent(&'static mut [T]),
 }
@@ -135,12 +122,12 @@ impl<T: Pod> Piece<T> {
     /// If a lent piece has no room: lengths are checked against [`Limits`] before.
     pub fn resize_zeroed(&mut self, length: usize) {
         match &mut self.memory {
-            Place::Heap(elements) => {
+            Store::Heap(elements) => {
                 // The old one goes first, so that both are never held at once.
                 *elements = Vec::new();
                 *elements = vec![T::zeroed(); length];
             }
-            Place::Lent(elements) => elements[..length].fill(T::zeroed()),
+            Store::Lent(elements) => elements[..length].fill(T::zeroed()),
         }
         self.length = length;
     }
@@ -156,8 +143,8 @@ impl<T> Deref for Piece<T> {
 
     fn deref(&self) -> &[T] {
         match &self.memory {
-            Place::Heap(elements) => elements,
-            Place::Lent(elements) => &elements[..self.length],
+            Store::Heap(elements) => elements,
+            Store::Lent(elements) => &elements[..self.length],
         }
     }
 }
@@ -165,8 +152,8 @@ impl<T> Deref for Piece<T> {
 impl<T> DerefMut for Piece<T> {
     fn deref_mut(&mut self) -> &mut [T] {
         match &mut self.memory {
-            Place::Heap(elements) => elements,
-            Place::Lent(elements) => &mut elements[..self.length],
+            Store::Heap(elements) => elements,
+            Store::Lent(elements) => &mut elements[..self.length],
         }
     }
 }
@@ -175,7 +162,7 @@ impl<T: Pod> Clone for Piece<T> {
     /// A copy on the heap.
     fn clone(&self) -> Piece<T> {
         Piece {
-            memory: Place::Heap(self.to_vec()),
+            memory: Store::Heap(self.to_vec()),
             length: self.length,
         }
     }
@@ -265,66 +252,141 @@ impl Memory for Heap {
     }
 }
 
-/// What the residual codec keeps beside a mirror.
+/// What profile `residual` keeps beside a mirror, on the heap unless it was lent.
 #[derive(Clone, Debug)]
 pub struct SliceHeap {
     slices: Piece<Slice>,
-    neighbours: Piece<Neighbours>,
+    patches: Piece<Patch>,
+    topology: Piece<u8>,
+    topology_used: u32,
+    values: Piece<u8>,
     last: Piece<i8>,
-    points_used: u32,
+    neighbours: Piece<Neighbours>,
+    places: Piece<Place>,
+    free: Piece<u64>,
+    scratch: Piece<PatchPoint>,
+    scratch_of: [u32; 3],
 }
 
 impl Default for SliceHeap {
     fn default() -> SliceHeap {
-        SliceHeap::new(0, 0)
+        SliceHeap::new(Capacity::default())
     }
 }
 
 impl SliceHeap {
-    /// Room for slices and their points, none of them open, on the heap.
-    pub fn new(slices: u32, points: u32) -> SliceHeap {
-        let mut heap = SliceHeap::from(&mut Source::Heap, slices, points);
-        heap.resize(slices, points);
+    /// Room as a header asks for, on the heap: no patch has come, no slice is open.
+    pub fn new(capacity: Capacity) -> SliceHeap {
+        let mut heap = SliceHeap::from(&mut Source::Heap, capacity);
+        heap.resize(capacity);
         heap
     }
 
-    /// Nothing yet, with room for slices and their points.
-    pub fn from(source: &mut Source, slices: u32, points: u32) -> SliceHeap {
+    /// Nothing yet, with room for a capacity.
+    pub fn from(source: &mut Source, most: Capacity) -> SliceHeap {
+        let points = u64::from(most.points);
         SliceHeap {
-            slices: source.piece(u64::from(slices)),
-            neighbours: source.piece(u64::from(points)),
-            last: source.piece(u64::from(points)),
-            points_used: 0,
+            slices: source.piece(u64::from(most.slices)),
+            patches: source.piece(u64::from(most.patches)),
+            topology: source.piece(u64::from(most.topology_bytes)),
+            topology_used: 0,
+            values: source.piece(points),
+            last: source.piece(points),
+            neighbours: source.piece(points),
+            places: source.piece(points),
+            free: source.piece(dirty::words(most.cells as usize) as u64),
+            scratch: source.piece(PATCH_POINTS as u64),
+            scratch_of: [0; 3],
         }
     }
 
-    /// So many slices and points, no slice open.
-    pub fn resize(&mut self, slices: u32, points: u32) {
-        self.slices.resize_zeroed(slices as usize);
-        self.neighbours.resize_zeroed(points as usize);
-        self.last.resize_zeroed(points as usize);
-        self.points_used = 0;
+    /// Room as a header asks for: no patch has come, no slice is open.
+    pub fn resize(&mut self, capacity: Capacity) {
+        let points = capacity.points as usize;
+        self.slices.resize_zeroed(capacity.slices as usize);
+        self.patches.resize_zeroed(capacity.patches as usize);
+        self.topology
+            .resize_zeroed(capacity.topology_bytes as usize);
+        self.values.resize_zeroed(points);
+        self.last.resize_zeroed(points);
+        self.neighbours.resize_zeroed(points);
+        self.places.resize_zeroed(points);
+        self.free
+            .resize_zeroed(dirty::words(capacity.cells as usize));
+        self.scratch.resize_zeroed(PATCH_POINTS);
+        self.slices().forget_patches();
+        self.slices().reset(capacity.cells);
     }
 
     /// Lends it to the codec.
     pub fn slices(&mut self) -> Slices<'_> {
         let SliceHeap {
             slices,
-            neighbours,
+            patches,
+            topology,
+            topology_used,
+            values,
             last,
-            points_used,
+            neighbours,
+            places,
+            free,
+            scratch,
+            scratch_of,
         } = self;
         Slices {
             slices,
-            neighbours,
+            patches,
+            topology,
+            topology_used,
+            values,
             last,
-            points_used,
+            neighbours,
+            places,
+            free,
+            scratch,
+            scratch_of,
         }
+    }
+
+    /// All slices, open or not.
+    pub fn get(&self) -> &[Slice] {
+        &self.slices
+    }
+
+    /// An open slice's occlusion, a point: 255 is open.
+    pub fn values(&self, slice: &Slice) -> &[u8] {
+        let first = slice.point_first as usize;
+        &self.values[first..first + slice.point_count as usize]
+    }
+
+    /// An open slice's last changes, a point.
+    pub fn last(&self, slice: &Slice) -> &[i8] {
+        let first = slice.point_first as usize;
+        &self.last[first..first + slice.point_count as usize]
+    }
+
+    /// An open slice's neighbours, a point.
+    pub fn neighbours(&self, slice: &Slice) -> &[Neighbours] {
+        let first = slice.point_first as usize;
+        &self.neighbours[first..first + slice.point_count as usize]
+    }
+
+    /// Whether all patches have come.
+    pub fn has_all_patches(&self) -> bool {
+        self.patches.iter().all(|patch| patch.bytes != 0)
     }
 
     /// Bytes held.
     pub fn bytes(&self) -> u64 {
-        self.slices.bytes() + self.neighbours.bytes() + self.last.bytes()
+        self.slices.bytes()
+            + self.patches.bytes()
+            + self.topology.bytes()
+            + self.values.bytes()
+            + self.last.bytes()
+            + self.neighbours.bytes()
+            + self.places.bytes()
+            + self.free.bytes()
+            + self.scratch.bytes()
     }
 }
 
@@ -333,7 +395,7 @@ mod tests {
     use super::*;
     use crate::{Client, State};
     use psao_core::mirror::Buffer;
-    use psao_core::stream::{self, Frame, PREAMBLE, flag, kind, write_packet};
+    use psao_core::stream::{self, Frame, PREAMBLE, Profile, flag, kind, write_packet};
 
     fn lent(lines: u64) -> Source {
         Source::Lent(Box::leak(vec![Line([0xa5; 64]); lines as usize].into()))
@@ -342,6 +404,8 @@ mod tests {
     /// A stream of one snapshot that sets bucket 1.
     fn stream_of(capacity: Capacity) -> Vec<u8> {
         let header = Header {
+            profile: Profile::Residual,
+            step: 1,
             capacity,
             max_body_bytes: 4096,
             max_raw_bytes: 4096,
@@ -372,11 +436,13 @@ mod tests {
             instances: 3,
             buckets: 70,
             cells,
+            slices: 5,
+            points: 77,
+            patches: 3,
+            topology_bytes: 100,
         };
         let limits = Limits {
             capacity: capacity(1000),
-            slices: 5,
-            points: 77,
             body_bytes: 4096,
             raw_bytes: 4096,
         };
@@ -391,7 +457,7 @@ mod tests {
             let pushed = client.push(&stream_of(capacity(cells))).unwrap();
             assert_eq!(pushed.frame.map(|frame| frame.id), Some(1));
             assert_eq!(client.state(), State::Live);
-            assert_eq!(client.mirror().capacity(), capacity(cells));
+            assert_eq!(client.mirror().cells().len(), cells as usize);
             assert_eq!(client.mirror().recompute_hash(), 0);
             // All that an upload has to fill is named.
             let runs: Vec<_> = client.mirror().dirty_runs(Buffer::Cells).collect();
@@ -419,6 +485,7 @@ mod tests {
             instances: u32::MAX,
             buckets: u32::MAX,
             cells: u32::MAX,
+            ..Capacity::default()
         };
         assert!(Client::lines(Limits::of_any(all)) > 1 << 32);
     }

@@ -66,8 +66,8 @@ const UPLINK_BUFFER_BYTES: usize = 1 << 20;
 const DATAGRAM_BUFFER_BYTES: usize = 1 << 10;
 
 /// Room for the body of a [`Hello`], a [`Camera`] and a [`Transform`].
-const HELLO_BYTES: usize = 32 + MAX_TOKEN_BYTES;
-const CAMERA_BYTES: usize = 56;
+const HELLO_BYTES: usize = 64 + MAX_TOKEN_BYTES;
+const CAMERA_BYTES: usize = 60;
 const TRANSFORM_BYTES: usize = 100;
 
 /// Most addresses of one name that are tried.
@@ -158,6 +158,8 @@ pub struct Connect<'a> {
     pub scene_hash: u64,
     /// Room the client has, as in [`crate::Config`].
     pub capacity: Capacity,
+    /// Of the patches that the client has already: [`crate::Client::topology_hash`].
+    pub topology_hash: u64,
 }
 
 /// Why a connection could not be opened.
@@ -350,6 +352,7 @@ impl Connection {
             token: connect.token.as_bytes(),
             scene_hash: connect.scene_hash,
             capacity: connect.capacity,
+            topology_hash: connect.topology_hash,
         };
         queue(&shared, kind::HELLO, HELLO_BYTES, |w| hello.write(w))
             .map_err(|_| ConnectError::Token(connect.token.len()))?;

@@ -9,13 +9,14 @@ pub const CELL_POINTS: usize = 7;
 /// Entries of a bucket.
 pub const BUCKET_ENTRIES: usize = 8;
 
-/// A grid cell's points: `CellData`. Empty places come last, so a reader stops at the first.
+/// A grid cell's points: `CellData`. A reader stops at the first [`Point::EMPTY`], and skips places
+/// without a point before it.
 #[repr(C, align(16))]
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
 pub struct Cell {
     /// The cell's dense index in its instance's grid: x + y·Dx + z·Dx·Dy.
     pub key: u32,
-    /// Points, empty ones last.
+    /// Points, and places without.
     pub points: [Point; CELL_POINTS],
 }
 
@@ -29,17 +30,23 @@ pub struct Bucket {
 }
 
 impl Cell {
-    /// How many points the cell holds.
-    pub fn len(&self) -> usize {
+    /// The points the cell holds.
+    pub fn points(&self) -> impl Iterator<Item = Point> + '_ {
         self.points
             .iter()
-            .take_while(|point| point.is_allocated())
-            .count()
+            .copied()
+            .take_while(|&point| point != Point::EMPTY)
+            .filter(|point| point.is_allocated())
+    }
+
+    /// How many points the cell holds.
+    pub fn len(&self) -> usize {
+        self.points().count()
     }
 
     /// The cell holds no point.
     pub fn is_empty(&self) -> bool {
-        !self.points[0].is_allocated()
+        self.points().next().is_none()
     }
 }
 

@@ -1,5 +1,6 @@
 //! The virtual grid of an instance, and where its cells hash to.
 
+use crate::topology::LEVELS;
 use bytemuck::{Pod, Zeroable};
 
 /// Most cells along an axis of a grid: a local coordinate in `f32` still tells 1/16 of a cell.
@@ -30,8 +31,9 @@ pub struct Instance {
     /// Factors that take a local normal to cell units (before normalising): 1 / `cells_per_unit`,
     /// scaled so that the largest is 1.
     pub normal_scale: [f32; 3],
-    /// Zero.
-    pub reserved: u32,
+    /// Profile `residual`: which of its mesh's points the instance has, 0 (all) to
+    /// [`crate::topology::LEVELS`] − 1; each level up has half as many. In profile `cells` 0.
+    pub level: u32,
 }
 
 /// Why an [`Instance`] cannot be used.
@@ -41,8 +43,8 @@ pub enum GridError {
     NotFinite,
     /// A dimension is 0 or above [`MAX_DIM`].
     Dims,
-    /// The reserved field is not 0.
-    Reserved,
+    /// There is no such level.
+    Level,
     /// Its buckets lie outside the bucket buffer.
     OutOfRange,
 }
@@ -68,8 +70,8 @@ impl Instance {
         if self.dims.iter().any(|&dim| dim == 0 || dim > MAX_DIM) {
             return Err(GridError::Dims);
         }
-        if self.reserved != 0 {
-            return Err(GridError::Reserved);
+        if self.level >= LEVELS {
+            return Err(GridError::Level);
         }
         match self.bucket_first.checked_add(self.bucket_count) {
             Some(end) if end <= buckets => Ok(()),
@@ -160,10 +162,10 @@ mod tests {
         );
         assert_eq!(
             check(Instance {
-                reserved: 1,
+                level: LEVELS,
                 ..good
             }),
-            Err(GridError::Reserved)
+            Err(GridError::Level)
         );
         assert_eq!(
             check(Instance {

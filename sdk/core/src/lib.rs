@@ -8,6 +8,8 @@
 //!   laid out as the client's GPU buffers hold it.
 //! * [`mirror`]: those buffers, their dirty ranges, and a hash that proves two mirrors equal.
 //! * [`stream`]: the packets of `docs/format.md`, reader and writer side by side.
+//! * [`topology`], over [`range`]: where a mesh's points are, in patches.
+//! * [`slices`]: patches on instances, whose points [`bins`] puts into cells.
 //! * [`residual`], over [`range`]: the coding of a slice's occlusion.
 //! * [`uplink`]: what the client tells the server.
 //! * [`lookup`]: the blend of the few points around a fragment; the definition for all shaders.
@@ -15,6 +17,7 @@
 //! `no_std`, no allocation, no `unsafe`: every buffer is the caller's and is bounded before use.
 #![no_std]
 
+pub mod bins;
 pub mod cell;
 pub mod dirty;
 pub mod grid;
@@ -25,6 +28,7 @@ pub mod range;
 pub mod residual;
 pub mod slices;
 pub mod stream;
+pub mod topology;
 pub mod uplink;
 
 pub use cell::{Bucket, Cell};

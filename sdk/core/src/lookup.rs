@@ -3,7 +3,7 @@
 //! A fragment at local position x with normal n blends the points of the 2×2×2 nearest cells of
 //! its instance's grid (paper, section 3.5). All lengths are in cells.
 
-use crate::cell::{Bucket, CELL_POINTS, Cell};
+use crate::cell::{Bucket, Cell};
 use crate::grid::Instance;
 use crate::point::{NORMALS, decode_position};
 
@@ -171,12 +171,7 @@ impl Blend {
 
     /// Adds a cell's points; `from` is the vector from the fragment to the cell's lower corner.
     fn add_cell(&mut self, cell: &Cell, from: Vec3) {
-        for point in cell
-            .points
-            .iter()
-            .take(CELL_POINTS)
-            .take_while(|p| p.is_allocated())
-        {
+        for point in cell.points() {
             let step = point.position();
             let d: Vec3 = core::array::from_fn(|axis| from[axis] + decode_position(step[axis]));
             let point_normal = NORMALS[point.normal() as usize];

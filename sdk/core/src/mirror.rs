@@ -5,9 +5,10 @@ use crate::cell::{Bucket, Cell};
 use crate::dirty;
 use crate::grid::{GridError, Instance};
 use crate::lookup::Lookup;
+use crate::point::Point;
 use core::ops::Range;
 
-/// How many of each the mirror has room for.
+/// How many of each a mirror, and what profile `residual` keeps beside it, have room for.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Capacity {
     /// Instances.
@@ -16,6 +17,15 @@ pub struct Capacity {
     pub buckets: u32,
     /// Cells, all instances together, and the unused cell 0.
     pub cells: u32,
+    /// Profile `residual`: slices, open or not. The fields from here on are 0 in profile `cells`,
+    /// and in [`Mirror::capacity`].
+    pub slices: u32,
+    /// Points of all slices that are open at a time.
+    pub points: u32,
+    /// Patches.
+    pub patches: u32,
+    /// Bytes of all patches together.
+    pub topology_bytes: u32,
 }
 
 impl Capacity {
@@ -24,6 +34,17 @@ impl Capacity {
         dirty::words(self.instances as usize)
             + dirty::words(self.buckets as usize)
             + dirty::words(self.cells as usize)
+    }
+
+    /// Whether all that `need` asks for fits.
+    pub fn holds(&self, need: &Capacity) -> bool {
+        self.instances >= need.instances
+            && self.buckets >= need.buckets
+            && self.cells >= need.cells
+            && self.slices >= need.slices
+            && self.points >= need.points
+            && self.patches >= need.patches
+            && self.topology_bytes >= need.topology_bytes
     }
 
     /// Bytes of the three buffers and the dirty sets.
@@ -163,6 +184,7 @@ impl<M: Memory> Mirror<M> {
             instances: parts.instances.len() as u32,
             buckets: parts.buckets.len() as u32,
             cells: parts.cells.len() as u32,
+            ..Capacity::default()
         }
     }
 
@@ -228,6 +250,28 @@ impl<M: Memory> Mirror<M> {
         Ok(())
     }
 
+    /// Sets one place of a cell: `place` as in [`crate::bins`]. Outside the buffer it is ignored.
+    pub(crate) fn set_point(&mut self, place: u32, point: Point) {
+        let (index, at) = (place >> 3, place & 7);
+        let capacity = self.capacity();
+        let parts = self.memory.parts_mut();
+        let cell = parts.cells.get_mut(index as usize);
+        if let Some(old) = cell.and_then(|cell| cell.points.get_mut(at as usize)) {
+            // Word 0 is the key.
+            let hash = |point: Point| word_hash(3, index, at + 1, point.0);
+            self.hash = self.hash.wrapping_sub(hash(*old)).wrapping_add(hash(point));
+            *old = point;
+            let (_, _, set) = split_sets(parts.dirty, capacity);
+            dirty::mark(set, capacity.cells as usize, index as usize);
+        }
+    }
+
+    /// What a place of a cell holds.
+    pub(crate) fn point(&self, place: u32) -> Option<Point> {
+        let cell = self.cells().get((place >> 3) as usize)?;
+        cell.points.get((place & 7) as usize).copied()
+    }
+
     /// The instance buffer.
     pub fn instances(&self) -> &[Instance] {
         self.memory.parts().instances
@@ -255,7 +299,7 @@ impl<M: Memory> Mirror<M> {
             let parts = values
                 .iter()
                 .enumerate()
-                .map(|(i, v)| element_hash(v, i as u32, kind));
+                .map(|(i, v)| hash_of(v, i as u32, kind));
             parts.fold(0, u64::wrapping_add)
         }
         let parts = self.memory.parts();
@@ -343,27 +387,26 @@ fn replace<T: bytemuck::Pod>(
     let old = values[index as usize];
     if bytemuck::bytes_of(&old) != bytemuck::bytes_of(&value) {
         *hash = hash
-            .wrapping_sub(element_hash(&old, index, kind))
-            .wrapping_add(element_hash(&value, index, kind));
+            .wrapping_sub(hash_of(&old, index, kind))
+            .wrapping_add(hash_of(&value, index, kind));
         values[index as usize] = value;
         dirty::mark(set, values.len(), index as usize);
     }
 }
 
-/// The part of one element in the mirror's hash: 0 for an all-zero one, so that unused capacity
-/// does not count. Words are little-endian.
-fn element_hash<T: bytemuck::Pod>(value: &T, index: u32, kind: u64) -> u64 {
-    let bytes = bytemuck::bytes_of(value);
-    if bytes.iter().all(|&byte| byte == 0) {
-        return 0;
-    }
-    let mut hash = mix(kind << 32 | u64::from(index));
-    for word in bytes.chunks_exact(8) {
-        let mut le = [0; 8];
-        le.copy_from_slice(word);
-        hash = mix(hash ^ u64::from_le_bytes(le));
-    }
-    hash
+/// The part of one element in the mirror's hash: each 32-bit word times its own factor. So a
+/// change of one word costs one multiplication, and what is zero does not count.
+fn hash_of<T: bytemuck::Pod>(value: &T, index: u32, kind: u64) -> u64 {
+    let words: &[u32] = bytemuck::cast_slice(core::slice::from_ref(value));
+    let parts = (0..)
+        .zip(words)
+        .map(|(at, &word)| word_hash(kind, index, at, word));
+    parts.fold(0, u64::wrapping_add)
+}
+
+fn word_hash(kind: u64, index: u32, at: u32, word: u32) -> u64 {
+    let factor = mix(kind << 56 | u64::from(index) << 8 | u64::from(at)) | 1;
+    factor.wrapping_mul(u64::from(word))
 }
 
 /// The finaliser of SplitMix64.
@@ -385,6 +428,7 @@ mod tests {
             instances: 3,
             buckets: 70,
             cells: 200,
+            ..Capacity::default()
         };
         let mut instances = vec![Instance::default(); 3];
         let mut buckets = vec![Bucket::default(); 70];

@@ -21,6 +21,9 @@ impl Point {
     /// No point here.
     pub const EMPTY: Point = Point(0);
 
+    /// A place that a point has left while others behind it stay: readers skip it.
+    pub const LEFT: Point = Point(1);
+
     /// Packs a point. `position`: steps of 1/32 cell an axis, 0..=31 (higher bits are cut off);
     /// `normal`: a code of [`encode_normal`]; `occlusion`: 255 is open.
     pub const fn pack(position: [u32; 3], normal: u8, occlusion: u8) -> Point {
@@ -112,6 +115,21 @@ pub static NORMALS: [[f32; 3]; 256] = {
             (n[1] as f64 / root) as f32,
             (n[2] as f64 / root) as f32,
         ];
+        code += 1;
+    }
+    table
+};
+
+/// The unit normals of all codes in 1/127, each component rounded towards 0.
+pub(crate) static NORMAL_STEPS: [[i32; 3]; 256] = {
+    let mut table = [[0; 3]; 256];
+    let mut code = 0;
+    while code < 256 {
+        let mut axis = 0;
+        while axis < 3 {
+            table[code][axis] = (NORMALS[code][axis] * 127.0) as i32;
+            axis += 1;
+        }
         code += 1;
     }
     table

@@ -110,6 +110,17 @@ impl<'a> Encoder<'a> {
         }
     }
 
+    /// Writes a number of `count` bits, 0 to 16, of which all are equally likely.
+    pub fn bits(&mut self, count: u32, value: u32) {
+        self.range >>= count;
+        self.add(self.range.wrapping_mul(u64::from(value)));
+        if self.range < NARROW {
+            self.put(4);
+            self.low <<= 32;
+            self.range <<= 32;
+        }
+    }
+
     /// Ends the run and says how many bytes it is.
     ///
     /// # Errors
@@ -183,6 +194,22 @@ impl<'a> Decoder<'a> {
             self.code = self.code.wrapping_sub(bound);
             self.range = self.range.wrapping_sub(bound);
         }
+        self.widen();
+        yes
+    }
+
+    /// Reads a number of `count` bits, 0 to 16, of which all are equally likely.
+    pub fn bits(&mut self, count: u32) -> u32 {
+        self.range >>= count;
+        // What the division leaves over belongs to the last number, though no encoder goes there.
+        let last = (1u64 << count).wrapping_sub(1);
+        let value = self.code.checked_div(self.range).unwrap_or(0).min(last);
+        self.code = self.code.wrapping_sub(self.range.wrapping_mul(value));
+        self.widen();
+        value as u32
+    }
+
+    fn widen(&mut self) {
         if self.range < NARROW {
             let end = self.taken.saturating_add(4);
             let next = match self.bytes.get(self.taken..end) {
@@ -193,7 +220,6 @@ impl<'a> Decoder<'a> {
             self.code = self.code << 32 | u64::from(next);
             self.range <<= 32;
         }
-        yes
     }
 
     /// Checks that the bytes end where the decisions do, as the encoder would have ended them.
@@ -279,6 +305,33 @@ mod tests {
             let read = decode(&decisions, &out[..length]).unwrap();
             let written = decisions.iter().map(|d| d.1);
             assert!(read.into_iter().eq(written), "seed {seed}");
+        }
+    }
+
+    #[test]
+    fn plain_numbers_among_decisions_are_read_as_written() {
+        let mut out = vec![0; 8192];
+        for seed in 1..500u32 {
+            let mut odds = Odds::new(3);
+            let mut encoder = Encoder::new(&mut out);
+            let of = |i: u32| {
+                let count = i.wrapping_mul(seed) % 17;
+                (count, i.wrapping_mul(2654435761) >> 15 & ((1 << count) - 1))
+            };
+            for i in 0..1000 {
+                let (count, value) = of(i);
+                encoder.bits(count, value);
+                encoder.bit(&mut odds, value & 1 != 0);
+            }
+            let length = encoder.finish().unwrap();
+            let mut odds = Odds::new(3);
+            let mut decoder = Decoder::new(&out[..length]);
+            for i in 0..1000 {
+                let (count, value) = of(i);
+                assert_eq!(decoder.bits(count), value);
+                assert_eq!(decoder.bit(&mut odds), value & 1 != 0);
+            }
+            decoder.finish().unwrap();
         }
     }
 }

@@ -14,23 +14,28 @@
     clippy::arithmetic_side_effects
 )]
 
-use crate::point::NORMALS;
+use crate::point::NORMAL_STEPS;
 use crate::range::{Decoder, Encoder, Full, Odds};
 use crate::stream::StreamError;
+use crate::topology::{PATCH_POINTS, PatchPoint};
 use bytemuck::{Pod, Zeroable};
 
 /// Most points of a slice.
-pub const SLICE_POINTS: usize = 1024;
+pub const SLICE_POINTS: usize = PATCH_POINTS;
 
-/// Points that share a flag for "nothing to do".
-const BLOCK: usize = 16;
+/// Points that share a flag for "nothing to do", and are in the client's cells or not.
+pub const BLOCK: usize = 16;
 
 /// Neighbours of a point that come before it, and as many that come after.
 const NEIGHBOURS: usize = 3;
 
 /// How far away in the slice's order a neighbour may be. Points are in Morton order, so those
 /// near in space are near in the order.
-const WINDOW: usize = 128;
+const WINDOW: usize = 64;
+
+/// The same for the item that opens a slice. Most slices never change again, so the search for
+/// better neighbours can wait for the first item after it.
+const WINDOW_FIRST: usize = 12;
 
 /// A point's nearest neighbours on the same surface, as distances in the slice's order; 0 where
 /// there is none. Made by [`find_neighbours`] from what both sides know.
@@ -43,57 +48,39 @@ pub struct Neighbours {
     pub later: [u8; NEIGHBOURS],
 }
 
-/// Normals in 1/127.
-static NORMAL_STEPS: [[i32; 3]; 256] = {
-    let mut table = [[0; 3]; 256];
-    let mut code = 0;
-    while code < 256 {
-        let mut axis = 0;
-        while axis < 3 {
-            #[allow(clippy::indexing_slicing, clippy::arithmetic_side_effects)]
-            {
-                table[code][axis] = (NORMALS[code][axis] * 127.0) as i32;
-                axis += 1;
-            }
-        }
-        #[allow(clippy::arithmetic_side_effects)]
-        {
-            code += 1;
-        }
-    }
-    table
-};
-
-/// Finds every point's neighbours in a slice.
+/// Finds every point's neighbours in a slice; `first`: those for the item that opens it, which are
+/// earlier ones only, and fewer to choose from.
 ///
-/// `positions` are in steps of 1/32 cell, anywhere; `normals` are codes of
-/// [`crate::point::encode_normal`]. All slices have the same length; what is longer than the
-/// shortest, or than [`SLICE_POINTS`], is left alone.
-pub fn find_neighbours(positions: &[[u32; 3]], normals: &[u8], out: &mut [Neighbours]) {
-    let count = positions.len().min(normals.len()).min(out.len());
-    let count = count.min(SLICE_POINTS);
+/// What is longer than the other, or than [`SLICE_POINTS`], is left alone.
+pub fn find_neighbours(points: &[PatchPoint], first: bool, out: &mut [Neighbours]) {
+    let window = if first { WINDOW_FIRST } else { WINDOW };
     // The nearest so far, near ones first: distance in space and in the order.
     const NONE: [(u32, u8); NEIGHBOURS] = [(u32::MAX, 0); NEIGHBOURS];
     let mut later = [NONE; SLICE_POINTS];
-    for (at, (position, normal)) in positions.iter().zip(normals).take(count).enumerate() {
+    let count = points.len().min(out.len()).min(SLICE_POINTS);
+    for (at, point) in points.iter().take(count).enumerate() {
         let mut earlier = NONE;
-        for back in 1..=WINDOW.min(at) {
-            let other = at.wrapping_sub(back);
-            let (Some(other_position), Some(other_normal), Some(other_later)) = (
-                positions.get(other),
-                normals.get(other),
-                later.get_mut(other),
-            ) else {
-                break;
+        let start = at.saturating_sub(window);
+        let (Some(others), Some(laters)) = (points.get(start..at), later.get_mut(start..at)) else {
+            break;
+        };
+        let others = others.iter().zip(laters).rev();
+        for (back, (other, other_later)) in (1u8..).zip(others) {
+            let squared = squared(&point.position, &other.position);
+            let wanted = if first {
+                farthest(&earlier)
+            } else {
+                farthest(&earlier).max(farthest(other_later))
             };
-            let squared = squared(position, other_position);
             // Facing another way only adds.
-            if squared >= farthest(&earlier).max(farthest(other_later)) {
+            if squared >= wanted {
                 continue;
             }
-            let apart = squared.saturating_add(turned(squared, *normal, *other_normal));
-            keep(&mut earlier, (apart, back as u8));
-            keep(other_later, (apart, back as u8));
+            let apart = squared.saturating_add(turned(squared, point.normal, other.normal));
+            keep(&mut earlier, (apart, back));
+            if !first {
+                keep(other_later, (apart, back));
+            }
         }
         if let Some(out) = out.get_mut(at) {
             out.earlier = earlier.map(|(_, back)| back);

@@ -1,7 +1,8 @@
-//! Slices of profile `residual`: runs of cells whose points' occlusion is coded together.
+//! Slices of profile `residual`: patches on instances, whose points' occlusion is coded together.
 //!
-//! A slice's points never move, so they are numbered once: cell by cell, place by place. What the
-//! codec keeps of each (its last change, its neighbours) lies beside the mirror, in that order.
+//! A slice's points never move, so they are numbered once, in the order of their patch. What the
+//! codec keeps of each lies beside the mirror, in that order. Blocks of points where all is open
+//! need not be in the mirror's cells at all.
 #![deny(
     clippy::unwrap_used,
     clippy::panic,
@@ -9,240 +10,483 @@
     clippy::arithmetic_side_effects
 )]
 
-use crate::cell::Cell;
+use crate::bins::{self, Bin, NOWHERE, Place};
+use crate::grid::Instance;
 use crate::mirror::{Memory, Mirror};
+use crate::point::Point;
 use crate::residual::{
-    Neighbours, Quantiser, SLICE_POINTS, SliceState, decode_slice, find_neighbours,
+    BLOCK, Neighbours, Quantiser, SLICE_POINTS, SliceState, decode_slice, find_neighbours,
 };
-use crate::stream::{Reader, StreamError, Writer};
+use crate::stream::{Changes, Reader, StreamError, Writer, apply_changes};
+use crate::topology::{PatchPoint, decode_patch};
 use bytemuck::{Pod, Zeroable};
 
 /// How a slice is coded the first time: exactly. What stands still stays exact from then on, and
-/// beside the cells that come along the bits are few.
+/// beside the patches that come along the bits are few.
 pub const FIRST: Quantiser = Quantiser {
     step: 1,
     dead_zone: 0,
 };
 
-/// A slice that has been opened.
+/// Where a patch's bytes are.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
+pub struct Patch {
+    /// Its first byte.
+    pub first: u32,
+    /// Bytes; 0 until the patch has come.
+    pub bytes: u32,
+}
+
+impl Patch {
+    fn range(&self) -> core::ops::Range<usize> {
+        let first = self.first as usize;
+        first..first.saturating_add(self.bytes as usize)
+    }
+}
+
+/// A patch on an instance.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
 pub struct Slice {
-    /// First cell.
-    pub cell_first: u32,
-    /// Cells; 0 until the slice is opened.
-    pub cell_count: u32,
+    /// Instance index.
+    pub instance: u32,
+    /// Patch index.
+    pub patch: u32,
     /// Its first point's place in the points' side data.
     pub point_first: u32,
-    /// Points, at most [`SLICE_POINTS`].
+    /// Points, at most [`SLICE_POINTS`]; 0 while the slice is closed.
     pub point_count: u32,
+    /// Blocks of [`BLOCK`] points that are in cells, the first in the lowest bit.
+    pub shown: u64,
+    /// 1 if its neighbours are those for items after the first.
+    neighbours_known: u32,
+    reserved: u32,
 }
 
-/// What the codec keeps beside a mirror: the caller's memory, fixed in size.
+impl Slice {
+    fn range(&self) -> core::ops::Range<usize> {
+        let first = self.point_first as usize;
+        first..first.saturating_add(self.point_count as usize)
+    }
+
+    /// All its blocks.
+    pub fn all_blocks(&self) -> u64 {
+        let blocks = self.point_count.div_ceil(BLOCK as u32);
+        1u64.checked_shl(blocks).unwrap_or(0).wrapping_sub(1)
+    }
+}
+
+/// What is kept beside a mirror: the caller's memory, fixed in size.
 #[derive(Debug)]
 pub struct Slices<'a> {
-    /// All slices, opened or not.
+    /// All slices, open or not.
     pub slices: &'a mut [Slice],
-    /// Each point's neighbours.
-    pub neighbours: &'a mut [Neighbours],
-    /// Each point's last change; as many as neighbours.
+    /// All patches, come or not.
+    pub patches: &'a mut [Patch],
+    /// Patches' bytes.
+    pub topology: &'a mut [u8],
+    /// Bytes of them that are in use.
+    pub topology_used: &'a mut u32,
+    /// Each point's occlusion; 255 is open.
+    pub values: &'a mut [u8],
+    /// Each point's last change; as many as values.
     pub last: &'a mut [i8],
-    /// Points given out so far.
-    pub points_used: &'a mut u32,
+    /// Each point's neighbours; as many as values.
+    pub neighbours: &'a mut [Neighbours],
+    /// Where each point is stored; as many as values.
+    pub places: &'a mut [Place],
+    /// The mirror's free cells, as a set of [`crate::dirty`].
+    pub free: &'a mut [u64],
+    /// Points of one patch: [`crate::topology::PATCH_POINTS`].
+    pub scratch: &'a mut [PatchPoint],
+    /// Which: its index, the level, and how many points that leaves; 0 points for none.
+    pub scratch_of: &'a mut [u32; 3],
 }
 
-/// The occlusion of a slice's points.
-#[derive(Clone, Debug)]
-pub struct Values {
-    values: [u8; SLICE_POINTS],
-    count: usize,
+/// What an item does.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Operation {
+    /// New occlusion.
+    Update,
+    /// New occlusion, and other blocks are in cells.
+    Show(u64),
+    /// The slice's first: instance, patch, first point; and its blocks in cells.
+    Open([u32; 3], u64),
+    /// The slice's points go. No data.
+    Close,
 }
 
-impl Values {
-    /// Reads the points of a run of cells.
+/// One item of a slices packet.
+#[derive(Clone, Copy, Debug)]
+pub struct Item<'a> {
+    /// Slice index.
+    pub index: u32,
+    /// What it does.
+    pub operation: Operation,
+    /// Points of the slice: how many blocks there are to show.
+    pub points: u32,
+    /// What [`crate::residual::encode_slice`] wrote.
+    pub bytes: &'a [u8],
+}
+
+/// Bytes that an item needs beside its data.
+pub const ITEM_HEADER_BYTES: usize = 5 * 5 + 8;
+
+impl Item<'_> {
+    /// Writes the item; `next` is one more than the item before's index, or 0.
     ///
     /// # Errors
-    /// More than [`SLICE_POINTS`].
-    pub fn of(cells: &[Cell]) -> Result<Values, StreamError> {
-        let mut out = Values {
-            values: [255; SLICE_POINTS],
-            count: 0,
+    /// There is no room, or the index is not above the one before.
+    pub fn write(&self, next: u32, w: &mut Writer<'_>) -> Result<(), StreamError> {
+        let gap = self.index.checked_sub(next).ok_or(StreamError::Value)?;
+        let head = gap.checked_mul(4).ok_or(StreamError::Value)?;
+        let (operation, opens, shown) = match self.operation {
+            Operation::Update => (0, None, None),
+            Operation::Show(shown) => (1, None, Some(shown)),
+            Operation::Open(opens, shown) => (2, Some(opens), Some(shown)),
+            Operation::Close => return w.varint(head | 3),
         };
-        for point in points(cells) {
-            let place = out.values.get_mut(out.count).ok_or(StreamError::Value)?;
-            *place = point.occlusion();
-            out.count = out.count.saturating_add(1);
+        w.varint(head | operation)?;
+        if let Some(opens) = opens {
+            opens.into_iter().try_for_each(|value| w.varint(value))?;
         }
-        Ok(out)
-    }
-
-    /// One a point.
-    pub fn get(&self) -> &[u8] {
-        self.values.get(..self.count).unwrap_or_default()
-    }
-
-    /// One a point.
-    pub fn get_mut(&mut self) -> &mut [u8] {
-        self.values.get_mut(..self.count).unwrap_or_default()
+        if let Some(shown) = shown {
+            w.bytes(
+                shown
+                    .to_le_bytes()
+                    .get(..shown_bytes(self.points))
+                    .unwrap_or_default(),
+            )?;
+        }
+        w.varint(self.bytes.len() as u32)?;
+        w.bytes(self.bytes)
     }
 }
 
-fn points(cells: &[Cell]) -> impl Iterator<Item = crate::Point> + '_ {
-    cells
-        .iter()
-        .flat_map(|cell| cell.points.into_iter().take_while(|p| p.is_allocated()))
+/// Bytes of the set of blocks of so many points.
+fn shown_bytes(points: u32) -> usize {
+    points.div_ceil(8 * BLOCK as u32).min(8) as usize
+}
+
+fn read_shown(r: &mut Reader<'_>, slice: &Slice) -> Result<u64, StreamError> {
+    let mut bytes = [0; 8];
+    let coded = r.take(shown_bytes(slice.point_count))?;
+    for (to, from) in bytes.iter_mut().zip(coded) {
+        *to = *from;
+    }
+    let shown = u64::from_le_bytes(bytes);
+    let exist = shown & !slice.all_blocks() == 0;
+    exist.then_some(shown).ok_or(StreamError::Value)
 }
 
 impl Slices<'_> {
-    /// Opens a slice: its points are those that the mirror's cells hold now.
-    ///
-    /// A cell without points is refused, and so the work that a slice can ask for is bounded by
-    /// its points.
+    /// Takes in a patch.
     ///
     /// # Errors
-    /// It is open already, or has no cell; a cell has no point; its instance has none; there are
-    /// more points than a slice or the side data has room for.
+    /// There is no such patch, another one has come in its place, or there is no room for it.
+    pub fn add_patch(&mut self, index: u32, bytes: &[u8]) -> Result<(), StreamError> {
+        let patch = self
+            .patches
+            .get_mut(index as usize)
+            .ok_or(StreamError::Value)?;
+        if patch.bytes != 0 {
+            // From an earlier stream: patches of one hash are the same.
+            let same = self.topology.get(patch.range()) == Some(bytes);
+            return same.then_some(()).ok_or(StreamError::Order);
+        }
+        if bytes.is_empty() {
+            return Err(StreamError::Length);
+        }
+        let first = *self.topology_used as usize;
+        let end = first.saturating_add(bytes.len());
+        let room = self
+            .topology
+            .get_mut(first..end)
+            .ok_or(StreamError::Value)?;
+        room.copy_from_slice(bytes);
+        *patch = Patch {
+            first: first as u32,
+            bytes: bytes.len() as u32,
+        };
+        *self.topology_used = end as u32;
+        Ok(())
+    }
+
+    /// Reads a patch's points of an instance's level into the scratch, and says how many.
+    fn read_points(&mut self, grid: &Instance, patch: u32) -> Result<usize, StreamError> {
+        let index = patch;
+        let [patch, level, count] = *self.scratch_of;
+        if count > 0 && [patch, level] == [index, grid.level] {
+            return Ok(count as usize);
+        }
+        let patch = self.patches.get(index as usize).ok_or(StreamError::Value)?;
+        let bytes = self.topology.get(patch.range()).unwrap_or_default();
+        if bytes.is_empty() {
+            return Err(StreamError::Order);
+        }
+        *self.scratch_of = [0; 3];
+        let count = decode_patch(bytes, self.scratch)?;
+        let mut kept = 0usize;
+        for at in 0..count {
+            let point = self.scratch.get(at).copied().unwrap_or_default();
+            if u32::from(point.level) >= grid.level {
+                if let Some(to) = self.scratch.get_mut(kept) {
+                    *to = point;
+                }
+                kept = kept.saturating_add(1);
+            }
+        }
+        *self.scratch_of = [index, grid.level, kept as u32];
+        Ok(kept)
+    }
+
+    /// Opens a slice: all its points are open and in no cell. Says how many there are; the scratch
+    /// holds them.
+    ///
+    /// # Errors
+    /// There is no such slice, or it is open already; its instance has no grid; its patch has not
+    /// come, or has no points of the instance's level; or its points' side data are outside the
+    /// memory, or another open slice's.
     pub fn open<M: Memory>(
         &mut self,
         mirror: &Mirror<M>,
         index: u32,
-        instance: u32,
-        cell_first: u32,
-        cell_count: u32,
+        [instance, patch, point_first]: [u32; 3],
     ) -> Result<(), StreamError> {
-        let cells = run(mirror, cell_first, cell_count)?;
-        let grid = mirror
-            .instances()
-            .get(instance as usize)
-            .filter(|grid| grid.bucket_count > 0)
-            .ok_or(StreamError::Value)?;
-        let slice = self
-            .slices
-            .get_mut(index as usize)
-            .ok_or(StreamError::Value)?;
-        if slice.cell_count != 0 || cell_count == 0 {
+        let grid = grid_of(mirror, instance)?;
+        let slice = self.slices.get(index as usize).ok_or(StreamError::Value)?;
+        if slice.point_count != 0 {
             return Err(StreamError::Order);
         }
-        let mut positions = [[0u32; 3]; SLICE_POINTS];
-        let mut normals = [0u8; SLICE_POINTS];
-        let mut count = 0usize;
-        let row = grid.dims[0];
-        // A grid of 2³² cells and more wraps, as its keys do.
-        let layer = row.wrapping_mul(grid.dims[1]).max(1);
-        for cell in cells {
-            if cell.is_empty() {
-                return Err(StreamError::Value);
-            }
-            let (z, rest) = (div(cell.key, layer), rem(cell.key, layer));
-            let corner = [rem(rest, row), div(rest, row), z];
-            for point in points(core::slice::from_ref(cell)) {
-                let (Some(position), Some(normal)) =
-                    (positions.get_mut(count), normals.get_mut(count))
-                else {
-                    return Err(StreamError::Value);
-                };
-                let step = point.position();
-                for (axis, place) in position.iter_mut().enumerate() {
-                    let (corner, step) = (corner.get(axis), step.get(axis));
-                    let corner = corner.copied().unwrap_or(0).wrapping_mul(32);
-                    *place = corner.wrapping_add(step.copied().unwrap_or(0));
-                }
-                *normal = point.normal();
-                count = count.saturating_add(1);
-            }
-        }
-        let first = *self.points_used as usize;
-        let end = first.saturating_add(count);
-        let (Some(neighbours), Some(last), Some(positions), Some(normals)) = (
-            self.neighbours.get_mut(first..end),
-            self.last.get_mut(first..end),
-            positions.get(..count),
-            normals.get(..count),
+        let count = self.read_points(&grid, patch)?;
+        let opened = Slice {
+            instance,
+            patch,
+            point_first,
+            point_count: count as u32,
+            ..Slice::default()
+        };
+        let range = opened.range();
+        let apart = |other: &Slice| {
+            let other = other.range();
+            other.is_empty() || other.end <= range.start || other.start >= range.end
+        };
+        let usable = count > 0 && range.end <= self.values.len() && self.slices.iter().all(apart);
+        let points = self.scratch.get(..count).unwrap_or_default();
+        let (true, Some(neighbours), Some(values), Some(last), Some(places), Some(slice)) = (
+            usable,
+            self.neighbours.get_mut(range.clone()),
+            self.values.get_mut(range.clone()),
+            self.last.get_mut(range.clone()),
+            self.places.get_mut(range.clone()),
+            self.slices.get_mut(index as usize),
         ) else {
             return Err(StreamError::Value);
         };
-        find_neighbours(positions, normals, neighbours);
+        find_neighbours(points, true, neighbours);
+        values.fill(255);
         last.fill(0);
-        *slice = Slice {
-            cell_first,
-            cell_count,
-            point_first: first as u32,
-            point_count: count as u32,
-        };
-        *self.points_used = end as u32;
+        places.fill(NOWHERE);
+        *slice = opened;
         Ok(())
     }
 
-    /// Forgets all slices, for a snapshot.
-    pub fn reset(&mut self) {
+    /// An open slice.
+    ///
+    /// # Errors
+    /// There is no such slice, or it is closed.
+    pub fn get(&self, index: u32) -> Result<Slice, StreamError> {
+        let slice = self.slices.get(index as usize).ok_or(StreamError::Value)?;
+        (slice.point_count != 0)
+            .then_some(*slice)
+            .ok_or(StreamError::Order)
+    }
+
+    /// Makes an open slice ready for an item after its first.
+    ///
+    /// # Errors
+    /// None of a slice that was opened.
+    pub fn prepare<M: Memory>(
+        &mut self,
+        mirror: &Mirror<M>,
+        index: u32,
+    ) -> Result<(), StreamError> {
+        let slice = self.get(index)?;
+        if slice.neighbours_known == 0 {
+            let count = self.read_points(&grid_of(mirror, slice.instance)?, slice.patch)?;
+            let points = self.scratch.get(..count).unwrap_or_default();
+            if let Some(neighbours) = self.neighbours.get_mut(slice.range()) {
+                find_neighbours(points, false, neighbours);
+            }
+            if let Some(slice) = self.slices.get_mut(index as usize) {
+                slice.neighbours_known = 1;
+            }
+        }
+        Ok(())
+    }
+
+    /// An open slice's neighbours and state.
+    pub fn side(&mut self, slice: &Slice) -> Option<(&[Neighbours], SliceState<'_>)> {
+        let range = slice.range();
+        let state = SliceState {
+            value: self.values.get_mut(range.clone())?,
+            last: self.last.get_mut(range.clone())?,
+        };
+        Some((self.neighbours.get(range)?, state))
+    }
+
+    /// Brings the mirror's cells to what a slice's values are now and were `before`, with the
+    /// blocks of `shown` in cells.
+    ///
+    /// # Errors
+    /// None of a slice that was opened.
+    pub fn settle<M: Memory>(
+        &mut self,
+        mirror: &mut Mirror<M>,
+        index: u32,
+        before: &[u8],
+        shown: u64,
+    ) -> Result<(), StreamError> {
+        let slice = self.get(index)?;
+        let range = slice.range();
+        let (Some(values), Some(places)) = (
+            self.values.get(range.clone()),
+            self.places.get(range.clone()),
+        ) else {
+            return Err(StreamError::Value);
+        };
+        for ((value, before), place) in values.iter().zip(before).zip(places) {
+            if value != before && *place != NOWHERE {
+                if let Some(point) = mirror.point(*place) {
+                    mirror.set_point(*place, point.with_occlusion(*value));
+                }
+            }
+        }
+        if shown == slice.shown {
+            return Ok(());
+        }
+        let grid = grid_of(mirror, slice.instance)?;
+        let count = self.read_points(&grid, slice.patch)?;
+        let (Some(points), Some(values), Some(places)) = (
+            self.scratch.get(..count),
+            self.values.get(range.clone()),
+            self.places.get_mut(range),
+        ) else {
+            return Err(StreamError::Value);
+        };
+        let is = |set: u64, at: usize| set >> (at.wrapping_div(BLOCK) & 63) & 1 != 0;
+        for (at, (point, place)) in points.iter().zip(&mut *places).enumerate() {
+            if is(slice.shown & !shown, at) && *place != NOWHERE {
+                let bin = Bin::of(&grid, point).ok_or(StreamError::Value)?;
+                bins::remove(mirror, self.free, &grid, bin, *place);
+                *place = NOWHERE;
+            }
+        }
+        let entering = points.iter().zip(values).zip(places).enumerate();
+        for (at, ((point, value), place)) in entering {
+            if is(shown & !slice.shown, at)
+                && let Some(bin) = Bin::of(&grid, point)
+            {
+                let point = Point::pack(bin.position, point.normal, *value);
+                *place = bins::insert(mirror, self.free, &grid, bin, point);
+            }
+        }
+        if let Some(slice) = self.slices.get_mut(index as usize) {
+            slice.shown = shown;
+        }
+        Ok(())
+    }
+
+    /// Closes a slice: its points go.
+    ///
+    /// # Errors
+    /// There is no such slice, or it is closed already.
+    pub fn close<M: Memory>(
+        &mut self,
+        mirror: &mut Mirror<M>,
+        index: u32,
+    ) -> Result<(), StreamError> {
+        self.settle(mirror, index, &[], 0)?;
+        if let Some(slice) = self.slices.get_mut(index as usize) {
+            *slice = Slice::default();
+        }
+        Ok(())
+    }
+
+    /// Forgets all patches; no slice may be open.
+    pub fn forget_patches(&mut self) {
+        self.patches.fill(Patch::default());
+        *self.topology_used = 0;
+        *self.scratch_of = [0; 3];
+    }
+
+    /// Closes all slices, for a snapshot; the mirror is reset beside it. Patches stay.
+    pub fn reset(&mut self, cells: u32) {
         self.slices.fill(Slice::default());
-        *self.points_used = 0;
+        bins::free_all(self.free, cells);
     }
 
-    /// An opened slice with its neighbours and last changes.
-    pub fn side(&mut self, index: u32) -> Option<(Slice, &[Neighbours], &mut [i8])> {
-        let slice = *self.slices.get(index as usize)?;
-        let first = slice.point_first as usize;
-        let points = first..first.saturating_add(slice.point_count as usize);
-        (slice.cell_count != 0).then_some(())?;
-        Some((
-            slice,
-            self.neighbours.get(points.clone())?,
-            self.last.get_mut(points)?,
-        ))
+    /// Whether an open slice is of this instance, whose grid then must not change.
+    pub fn uses(&self, instance: u32) -> bool {
+        let of = |slice: &Slice| slice.point_count != 0 && slice.instance == instance;
+        self.slices.iter().any(of)
     }
 }
 
-fn div(a: u32, b: u32) -> u32 {
-    a.checked_div(b).unwrap_or(0)
+fn grid_of<M: Memory>(mirror: &Mirror<M>, instance: u32) -> Result<Instance, StreamError> {
+    let grid = mirror.instances().get(instance as usize);
+    let grid = grid.filter(|grid| grid.bucket_count > 0);
+    grid.copied().ok_or(StreamError::Value)
 }
 
-fn rem(a: u32, b: u32) -> u32 {
-    a.checked_rem(b).unwrap_or(0)
-}
-
-/// A run of a mirror's cells.
-fn run<M: Memory>(mirror: &Mirror<M>, first: u32, count: u32) -> Result<&[Cell], StreamError> {
-    let end = first.checked_add(count).ok_or(StreamError::Value)?;
-    mirror
-        .cells()
-        .get(first as usize..end as usize)
-        .ok_or(StreamError::Value)
-}
-
-/// Gives a slice's points new occlusion. As many values as the slice has points.
+/// Applies the decompressed content of a frame packet of profile `residual`: instances alone,
+/// none of which may have open slices.
 ///
 /// # Errors
-/// The slice is not in the mirror.
-pub fn store<M: Memory>(
+/// As [`apply_changes`], and for anything else.
+pub fn apply_instances<M: Memory>(
+    raw: &[u8],
     mirror: &mut Mirror<M>,
-    slice: Slice,
-    values: &[u8],
-) -> Result<(), StreamError> {
-    let mut values = values.iter();
-    for index in slice.cell_first..slice.cell_first.saturating_add(slice.cell_count) {
-        let mut cell = *mirror
-            .cells()
-            .get(index as usize)
+    slices: &Slices<'_>,
+) -> Result<Changes, StreamError> {
+    let mut r = Reader(raw);
+    let [count, buckets, cells] = [r.u32()?, r.u32()?, r.u32()?];
+    if [buckets, cells] != [0; 2] {
+        return Err(StreamError::Value);
+    }
+    let gaps = r.take((count as usize).saturating_mul(4))?;
+    let mut next = 0u32;
+    for gap in gaps.as_chunks::<4>().0 {
+        let index = next
+            .checked_add(u32::from_le_bytes(*gap))
             .ok_or(StreamError::Value)?;
-        let mut changed = 0;
-        for point in cell
-            .points
-            .iter_mut()
-            .take_while(|point| point.is_allocated())
-        {
-            let new = point.with_occlusion(*values.next().ok_or(StreamError::Value)?);
-            changed |= new.0 ^ point.0;
-            *point = new;
-        }
-        if changed != 0 {
-            mirror.set_cell(index, cell)?;
+        next = index.checked_add(1).ok_or(StreamError::Value)?;
+        if slices.uses(index) {
+            return Err(StreamError::Order);
         }
     }
-    Ok(())
+    apply_changes(raw, mirror)
 }
 
-/// Applies the content of a slices packet: items until its end.
+/// Applies the body of a patches packet: patches until its end. Returns how many.
+///
+/// # Errors
+/// The content is not what a server writes.
+pub fn apply_patches(content: &[u8], slices: &mut Slices<'_>) -> Result<u32, StreamError> {
+    let mut r = Reader(content);
+    let (mut next, mut count) = (0u32, 0u32);
+    while !r.0.is_empty() {
+        let index = next.checked_add(r.varint()?).ok_or(StreamError::Value)?;
+        next = index.checked_add(1).ok_or(StreamError::Value)?;
+        let length = r.varint()? as usize;
+        slices.add_patch(index, r.take(length)?)?;
+        count = count.saturating_add(1);
+    }
+    Ok(count)
+}
+
+/// Applies the content of a slices packet: items until its end. Returns how many.
 ///
 /// # Errors
 /// The content is not what a server writes. The mirror and the slices must then be reset by a
@@ -256,55 +500,35 @@ pub fn apply_slices<M: Memory>(
     let mut r = Reader(content);
     let (mut next, mut count) = (0u32, 0u32);
     while !r.0.is_empty() {
-        // The lowest bit says that the slice is new.
         let head = r.varint()?;
-        let index = next.checked_add(head >> 1).ok_or(StreamError::Value)?;
+        let index = next.checked_add(head >> 2).ok_or(StreamError::Value)?;
         next = index.checked_add(1).ok_or(StreamError::Value)?;
-        let first = head & 1 != 0;
-        if first {
-            let (instance, cell_first, cell_count) = (r.varint()?, r.varint()?, r.varint()?);
-            slices.open(mirror, index, instance, cell_first, cell_count)?;
+        count = count.saturating_add(1);
+        let operation = head & 3;
+        match operation {
+            2 => slices.open(mirror, index, [r.varint()?, r.varint()?, r.varint()?])?,
+            3 => {
+                slices.close(mirror, index)?;
+                continue;
+            }
+            _ => slices.prepare(mirror, index)?,
         }
+        let slice = slices.get(index)?;
+        let shown = match operation {
+            0 => slice.shown,
+            _ => read_shown(&mut r, &slice)?,
+        };
         let length = r.varint()? as usize;
         let bytes = r.take(length)?;
-        let (slice, neighbours, last) = slices.side(index).ok_or(StreamError::Order)?;
-        let mut values = Values::of(run(mirror, slice.cell_first, slice.cell_count)?)?;
-        if values.get().len() != slice.point_count as usize {
-            return Err(StreamError::Value);
+        let first = operation == 2;
+        let (neighbours, mut state) = slices.side(&slice).ok_or(StreamError::Value)?;
+        let mut before = [255; SLICE_POINTS];
+        for (before, value) in before.iter_mut().zip(&*state.value) {
+            *before = *value;
         }
-        let mut state = SliceState {
-            value: values.get_mut(),
-            last,
-        };
         let step = if first { FIRST.step } else { step };
         decode_slice(neighbours, step, &mut state, first, bytes)?;
-        store(mirror, slice, values.get())?;
-        count = count.saturating_add(1);
+        slices.settle(mirror, index, &before, shown)?;
     }
     Ok(count)
-}
-
-/// One item of a slices packet.
-#[derive(Clone, Copy, Debug)]
-pub struct Item<'a> {
-    /// Slice index.
-    pub index: u32,
-    /// For a new slice: instance, first cell, cells.
-    pub opens: Option<[u32; 3]>,
-    /// What [`crate::residual::encode_slice`] wrote.
-    pub bytes: &'a [u8],
-}
-
-impl Item<'_> {
-    /// Writes the item; `next` is one more than the item before's index, or 0.
-    pub fn write(&self, next: u32, w: &mut Writer<'_>) -> Result<(), StreamError> {
-        let gap = self.index.checked_sub(next).ok_or(StreamError::Value)?;
-        let head = gap.checked_mul(2).ok_or(StreamError::Value)?;
-        w.varint(head | u32::from(self.opens.is_some()))?;
-        if let Some(opens) = self.opens {
-            opens.into_iter().try_for_each(|value| w.varint(value))?;
-        }
-        w.varint(self.bytes.len() as u32)?;
-        w.bytes(self.bytes)
-    }
 }

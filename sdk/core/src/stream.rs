@@ -9,6 +9,7 @@
     clippy::arithmetic_side_effects
 )]
 
+use crate::bins::MAX_CELLS;
 use crate::cell::{BUCKET_ENTRIES, Bucket, CELL_POINTS, Cell};
 use crate::grid::Instance;
 use crate::lookup::Kernel;
@@ -46,9 +47,11 @@ pub mod kind {
     pub const END: u8 = 3;
     /// The server will not serve. [`super::Refusal`].
     pub const REFUSE: u8 = 4;
-    /// A part of a frame's changes: occlusion of slices. [`super::Frame`], then
-    /// [`crate::slices`]' items. Profile `residual` only.
+    /// A part of a frame's changes: slices. [`super::Frame`], then [`crate::slices`]' items.
+    /// Profile `residual` only.
     pub const SLICES: u8 = 5;
+    /// Patches, in no frame. Profile `residual` only.
+    pub const PATCHES: u8 = 6;
 }
 
 /// Flags of a packet.
@@ -134,8 +137,8 @@ pub enum Profile {
     /// The paper's (section 3.4): changed buckets and whole changed cells, zstd.
     #[default]
     Cells = 0,
-    /// Each cell once; after that only its points' occlusion, predicted and entropy coded, slice
-    /// by slice.
+    /// Where points are once, a mesh; after that only their occlusion, predicted and entropy
+    /// coded, slice by slice.
     Residual = 1,
 }
 
@@ -164,10 +167,8 @@ pub struct Header {
     pub threshold: u8,
     /// Profile `residual`: occlusion changes in multiples of this many 1/255, 1 or more.
     pub step: u8,
-    /// Profile `residual`: slices in all.
-    pub slices: u32,
-    /// Profile `residual`: points of all slices.
-    pub points: u32,
+    /// Profile `residual`: tells all patches together from others; 0 for none to tell.
+    pub topology_hash: u64,
 }
 
 /// What every part of a frame says of it.
@@ -352,10 +353,11 @@ impl Header {
             return Err(StreamError::Value);
         }
         let scene_hash = r.u64()?;
-        let capacity = Capacity {
+        let mut capacity = Capacity {
             instances: r.u32()?,
             buckets: r.u32()?,
             cells: r.u32()?,
+            ..Capacity::default()
         };
         let (max_body_bytes, max_raw_bytes) = (r.u32()?, r.u32()?);
         let (ao_distance_m, density, rate_hz) = (r.f32()?, r.f32()?, r.f32()?);
@@ -363,15 +365,18 @@ impl Header {
         if r.array::<2>()? != [0; 2] {
             return Err(StreamError::Value);
         }
-        let (slices, points) = (r.u32()?, r.u32()?);
+        let beside = [r.u32()?, r.u32()?, r.u32()?, r.u32()?];
+        let topology_hash = r.u64()?;
         let fits = match profile {
-            Profile::Cells => [u32::from(step), slices, points] == [0; 3],
-            // A slice has a cell, and a cell no more than its places.
-            Profile::Residual => {
-                let places = u64::from(capacity.cells).saturating_mul(CELL_POINTS as u64);
-                step > 0 && slices <= capacity.cells && u64::from(points) <= places
-            }
+            Profile::Cells => step == 0 && beside == [0; 4] && topology_hash == 0,
+            Profile::Residual => step > 0 && capacity.cells <= MAX_CELLS,
         };
+        [
+            capacity.slices,
+            capacity.points,
+            capacity.patches,
+            capacity.topology_bytes,
+        ] = beside;
         if !fits {
             return Err(StreamError::Value);
         }
@@ -395,8 +400,7 @@ impl Header {
             rate_hz,
             threshold,
             step,
-            slices,
-            points,
+            topology_hash,
         })
     }
 
@@ -411,6 +415,10 @@ impl Header {
             instances,
             buckets,
             cells,
+            slices,
+            points,
+            patches,
+            topology_bytes,
         } = self.capacity;
         for value in [
             instances,
@@ -425,8 +433,10 @@ impl Header {
             w.f32(value)?;
         }
         w.bytes(&[self.threshold, self.step, 0, 0])?;
-        w.u32(self.slices)?;
-        w.u32(self.points)
+        for value in [slices, points, patches, topology_bytes] {
+            w.u32(value)?;
+        }
+        w.u64(self.topology_hash)
     }
 }
 

@@ -44,8 +44,12 @@ pub struct Hello<'a> {
     pub token: &'a [u8],
     /// Hash of the client's scene; 0 accepts any.
     pub scene_hash: u64,
-    /// Room the client has; the server refuses a scene that needs more.
+    /// Room the client has. The server refuses a scene that needs more, but for points and cells
+    /// of profile `residual`: of those it keeps what is in view.
     pub capacity: Capacity,
+    /// [`crate::stream::Header::topology_hash`] of the patches that the client has already, all of
+    /// them; 0 if it has none.
+    pub topology_hash: u64,
 }
 
 /// Where the client looks from: decides what is sent first, and what not at all.
@@ -61,6 +65,8 @@ pub struct Camera {
     pub fov_y_rad: f32,
     /// Width over height.
     pub aspect: f32,
+    /// Rows of the picture; 0 if it is not to decide the level of detail.
+    pub height_px: u32,
 }
 
 /// The engine moved an instance.
@@ -134,7 +140,12 @@ impl<'a> Message<'a> {
                     instances: r.u32()?,
                     buckets: r.u32()?,
                     cells: r.u32()?,
+                    slices: r.u32()?,
+                    points: r.u32()?,
+                    patches: r.u32()?,
+                    topology_bytes: r.u32()?,
                 };
+                let topology_hash = r.u64()?;
                 let token_bytes = r.u16()? as usize;
                 if token_bytes > MAX_TOKEN_BYTES {
                     return Err(StreamError::Value);
@@ -144,6 +155,7 @@ impl<'a> Message<'a> {
                     token,
                     scene_hash,
                     capacity,
+                    topology_hash,
                 })));
             }
             kind::CAMERA => {
@@ -153,6 +165,7 @@ impl<'a> Message<'a> {
                     up: [r.f32()?, r.f32()?, r.f32()?],
                     fov_y_rad: r.f32()?,
                     aspect: r.f32()?,
+                    height_px: r.u32()?,
                 };
                 if !camera.is_usable() {
                     return Err(StreamError::Value);
@@ -210,9 +223,27 @@ impl Hello<'_> {
         w.u16(VERSION_MAJOR)?;
         w.u16(VERSION_MINOR)?;
         w.u64(self.scene_hash)?;
-        w.u32(self.capacity.instances)?;
-        w.u32(self.capacity.buckets)?;
-        w.u32(self.capacity.cells)?;
+        let Capacity {
+            instances,
+            buckets,
+            cells,
+            slices,
+            points,
+            patches,
+            topology_bytes,
+        } = self.capacity;
+        for value in [
+            instances,
+            buckets,
+            cells,
+            slices,
+            points,
+            patches,
+            topology_bytes,
+        ] {
+            w.u32(value)?;
+        }
+        w.u64(self.topology_hash)?;
         w.u16(self.token.len() as u16)?;
         w.bytes(self.token)
     }
@@ -240,7 +271,8 @@ impl Camera {
             .chain(&self.up)
             .try_for_each(|v| w.f32(*v))?;
         w.f32(self.fov_y_rad)?;
-        w.f32(self.aspect)
+        w.f32(self.aspect)?;
+        w.u32(self.height_px)
     }
 }
 

@@ -20,7 +20,7 @@ const FIRST_BODY_BYTES: u32 = 4096;
 /// Follows one stream, in memory of yours. Opaque.
 ///
 /// Two sides use it: the pusher (psao_client_push, psao_client_restart, psao_client_header,
-/// psao_client_stats, psao_client_error_text) and the taker (psao_client_take,
+/// psao_client_topology_hash, psao_client_stats, psao_client_error_text) and the taker (psao_client_take,
 /// psao_client_dirty_ranges, psao_client_lookup, psao_client_release). Each side must be one
 /// thread at a time. With psao_config.two_threads both sides may run at once, and neither ever
 /// waits for the other; without, they must not. psao_client_status is anyone's, at any time.
@@ -189,6 +189,8 @@ impl Default for psao_config {
             cell_count: 0,
             slice_count: 0,
             point_count: 0,
+            patch_count: 0,
+            topology_bytes: 0,
             max_body_bytes: 0,
             max_raw_bytes: 0,
         }
@@ -650,6 +652,31 @@ pub unsafe extern "C" fn psao_client_status(
     }
 }
 
+/// Reads the hash of the patches that the client has got, for psao_uplink_hello of a new
+/// connection: the server then need not send them again. 0 if some are missing. Read it before
+/// psao_client_restart, and keep the client.
+///
+/// A recording of patches alone (psao record --topology), shipped with the app and pushed first,
+/// gives the same.
+///
+/// Threads: pusher. No alloc, lock or log. Since ABI 1.
+///
+/// # Safety
+/// The pointers are as described.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn psao_client_topology_hash(
+    client: *const psao_client,
+    out_hash: *mut u64,
+) -> psao_result {
+    // SAFETY: the caller's word; it is the pusher's.
+    unsafe {
+        with(client, |client| {
+            put(out_hash, client.pusher().client.topology_hash())?;
+            Ok(PSAO_OK)
+        })
+    }
+}
+
 /// Reads the totals.
 ///
 /// Threads: pusher. No alloc, lock or log. Since ABI 1.
@@ -681,6 +708,7 @@ pub unsafe extern "C" fn psao_client_stats(
                 bucket_count: stats.buckets,
                 cell_count: stats.cells,
                 slice_count: stats.slices,
+                patch_count: stats.patches,
             };
             write_struct(out_stats, &stats)?;
             Ok(PSAO_OK)

@@ -91,6 +91,7 @@ fn capacity_of(parts: Parts<'_>) -> Capacity {
         instances: parts.instances.len() as u32,
         buckets: parts.buckets.len() as u32,
         cells: parts.cells.len() as u32,
+        ..Capacity::default()
     }
 }
 

@@ -55,10 +55,14 @@ pub struct psao_config {
     pub bucket_count: u32,
     /// Most cells, of all instances, and one.
     pub cell_count: u32,
-    /// Most slices. 0: as many as cells.
+    /// Most slices. This and the next three are 0 for streams of profile cells.
     pub slice_count: u32,
-    /// Most points of all slices. 0: seven a cell.
+    /// Most points of slices that are open at a time.
     pub point_count: u32,
+    /// Most patches: parts of meshes with their points.
+    pub patch_count: u32,
+    /// Most bytes of all patches.
+    pub topology_bytes: u32,
     /// Largest packet. 0: the format's limit, 4 MiB.
     pub max_body_bytes: u32,
     /// Largest decompressed packet. 0: the format's limit, 4 MiB.
@@ -250,8 +254,10 @@ pub struct psao_stats {
     pub bucket_count: u64,
     /// Cells received.
     pub cell_count: u64,
-    /// Slices received.
+    /// Changes of slices received.
     pub slice_count: u64,
+    /// Patches received.
+    pub patch_count: u64,
 }
 
 /// Counts a connection's messages: one for what goes up the stream, another one for datagrams.
@@ -273,8 +279,8 @@ pub struct psao_camera {
     pub fov_y_rad: f32,
     /// Width over height, above 0.001 and below 1000.
     pub aspect: f32,
-    /// Zero.
-    pub reserved: u32,
+    /// Rows of the picture: decides how fine what is far away needs to be. 0: all as fine as near.
+    pub height_px: u32,
     /// World position.
     pub position_m: [f64; 3],
     /// View direction, not zero.
@@ -373,9 +379,11 @@ impl psao_config {
                 instances: self.instance_count,
                 buckets: self.bucket_count,
                 cells: self.cell_count,
+                slices: self.slice_count,
+                points: self.point_count,
+                patches: self.patch_count,
+                topology_bytes: self.topology_bytes,
             },
-            slices: or(self.slice_count, self.cell_count),
-            points: or(self.point_count, self.cell_count.saturating_mul(7)),
             body_bytes: or(self.max_body_bytes, any.body_bytes),
             raw_bytes: or(self.max_raw_bytes, any.raw_bytes),
         }
@@ -383,14 +391,15 @@ impl psao_config {
 
     /// Sets what a stream needs.
     pub(crate) fn set_limits(&mut self, need: Limits) {
-        // 0 would be the default.
-        let known = |value: u32| value.max(1);
         self.instance_count = need.capacity.instances;
         self.bucket_count = need.capacity.buckets;
         self.cell_count = need.capacity.cells;
-        self.slice_count = known(need.slices);
-        self.point_count = known(need.points);
-        self.max_body_bytes = known(need.body_bytes);
-        self.max_raw_bytes = known(need.raw_bytes);
+        self.slice_count = need.capacity.slices;
+        self.point_count = need.capacity.points;
+        self.patch_count = need.capacity.patches;
+        self.topology_bytes = need.capacity.topology_bytes;
+        self.max_body_bytes = need.body_bytes;
+        // 0 would be the default.
+        self.max_raw_bytes = need.raw_bytes.max(1);
     }
 }

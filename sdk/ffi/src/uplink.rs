@@ -10,7 +10,12 @@ use psao::core::uplink::{self, Camera, Hello, MAX_JOINTS, MAX_TOKEN_BYTES, Trans
 pub const PSAO_UPLINK_MAX_BYTES: u32 = 196632;
 
 /// The longest message of any other psao_uplink_ function.
-pub const PSAO_UPLINK_SMALL_BYTES: u32 = 300;
+pub const PSAO_UPLINK_SMALL_BYTES: u32 = 384;
+
+/// Bodies' lengths: docs/format.md, 10.3 to 10.6. The hello's without the token.
+const HELLO_BYTES: usize = 50;
+const CAMERA_BYTES: usize = 60;
+const TRANSFORM_BYTES: usize = 100;
 
 const _: () = assert!(
     PSAO_UPLINK_MAX_BYTES == PACKET_HEADER_BYTES as u32 + uplink::MAX_UPLINK_BODY_BYTES - 8
@@ -50,7 +55,8 @@ unsafe fn message(
 /// uplink to begin.
 ///
 /// config: the client's; the server refuses a scene that needs larger counts. token, token_bytes:
-/// at most 256 bytes, the one that the server was started with.
+/// at most 256 bytes, the one that the server was started with. topology_hash: of
+/// psao_client_topology_hash; 0 for a new client.
 ///
 /// out: capacity_bytes; PSAO_UPLINK_SMALL_BYTES are enough. out_bytes: how long the message is.
 ///
@@ -66,6 +72,7 @@ pub unsafe extern "C" fn psao_uplink_hello(
     config: *const psao_config,
     token: *const u8,
     token_bytes: usize,
+    topology_hash: u64,
     out: *mut u8,
     capacity_bytes: usize,
     out_bytes: *mut usize,
@@ -81,6 +88,7 @@ pub unsafe extern "C" fn psao_uplink_hello(
             token,
             scene_hash: config.scene_hash,
             capacity: config.limits().capacity,
+            topology_hash,
         };
         if uplink.is_null() {
             return Err(PSAO_ERROR_NULL);
@@ -121,12 +129,13 @@ pub unsafe extern "C" fn psao_uplink_camera(
             up: camera.up,
             fov_y_rad: camera.fov_y_rad,
             aspect: camera.aspect,
+            height_px: camera.height_px,
         };
         if !camera.is_usable() {
             return Err(PSAO_ERROR_VALUE);
         }
         let out = (out, capacity_bytes, out_bytes);
-        message(uplink, out, kind::CAMERA, 56, |w| camera.write(w))
+        message(uplink, out, kind::CAMERA, CAMERA_BYTES, |w| camera.write(w))
     })
 }
 
@@ -166,7 +175,9 @@ pub unsafe extern "C" fn psao_uplink_transform(
             world_from_local: *world_from_local,
         };
         let out = (out, capacity_bytes, out_bytes);
-        message(uplink, out, kind::TRANSFORM, 100, |w| transform.write(w))
+        message(uplink, out, kind::TRANSFORM, TRANSFORM_BYTES, |w| {
+            transform.write(w)
+        })
     })
 }
 

@@ -1,0 +1,754 @@
+//! Profile `residual`: patches once, then slices' occlusion, the largest visible error first.
+
+use super::{Compression, FrameStats, View, capacity_of, compress, compressor, write_content};
+use crate::world::{Slice, World};
+use glam::Vec3;
+use psao::memory::{Heap, SliceHeap};
+use psao_core::mirror::Capacity;
+use psao_core::residual::{MAX_SLICE_BYTES, Quantiser, SliceState, encode_slice};
+use psao_core::slices::{self, FIRST, ITEM_HEADER_BYTES, Item, Operation};
+use psao_core::stream::{CHANGES_HEADER_BYTES, Writer, kind};
+use psao_core::topology::LEVELS;
+use psao_core::{Instance, Mirror};
+use rayon::prelude::*;
+use std::collections::BTreeMap;
+use std::ops::Range;
+
+/// What a client gets at most.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Limits {
+    /// Stream bits a second, in millions; 0 for no limit. What does not fit waits.
+    pub max_mbit: f64,
+    /// Points a pixel: instances farther away get fewer points; 0 for all of them always.
+    pub points_per_pixel: f32,
+    /// Most points and cells at the client; 0 for room for all. Slices that have not been seen
+    /// for longest make room for others.
+    pub points: u32,
+    /// As `points`.
+    pub cells: u32,
+}
+
+impl Limits {
+    /// No more than a client has room for.
+    pub fn fit(&mut self, room: &Capacity) {
+        let least = |limit: u32, room: u32| if limit == 0 { room } else { limit.min(room) };
+        self.points = least(self.points, room.points);
+        self.cells = least(self.cells, room.cells);
+    }
+}
+
+/// Largest content of a packet of patches or slices.
+const PACKET_BYTES: usize = 1 << 18;
+
+/// Slices coded side by side before the budget is looked at again.
+const BATCH: usize = 64;
+
+/// Frames over which a change of the level of detail is faded, at least.
+const FADE_S: f32 = 0.4;
+
+/// What a client of profile `residual` has.
+pub struct Residual {
+    pub mirror: Mirror<Heap>,
+    pub heap: SliceHeap,
+    /// Frames a second, as the header says.
+    pub rate_hz: f32,
+    capacity: Capacity,
+    quantiser: Quantiser,
+    limits: Limits,
+    /// Patches that the client has.
+    has_patch: Vec<bool>,
+    /// Slices whose occlusion, or cells, may differ from the client's.
+    due: Vec<bool>,
+    /// The frame in which each slice was last in view.
+    seen: Vec<u64>,
+    frames: u64,
+    /// Slices on their way from one level's picture to another's.
+    fades: BTreeMap<u32, Fade>,
+    space: Space,
+    /// Bytes sent beyond the budget so far.
+    debt: f64,
+}
+
+/// Occlusion that a slice's points begin with, so that the picture does not jump.
+struct Fade {
+    from: Vec<u8>,
+    begun: u64,
+}
+
+/// What a frame sends.
+pub struct Packets {
+    /// Bodies of patches packets.
+    pub patches: Vec<Vec<u8>>,
+    /// Kind, bytes before compression, and content of the frame's packets.
+    pub packets: Vec<(u8, usize, Vec<u8>)>,
+}
+
+/// A slice that the client lacks something of.
+struct Lack {
+    index: u32,
+    opens: bool,
+    /// Visible error: squared, over all points, a square metre's part of the picture.
+    weight: f32,
+}
+
+/// A slice, coded.
+struct Coded {
+    index: u32,
+    opens: Option<[u32; 3]>,
+    values: Vec<u8>,
+    last: Vec<i8>,
+    bytes: Vec<u8>,
+}
+
+impl Residual {
+    pub fn new(world: &World, quantiser: Quantiser, limits: Limits, has_patches: bool) -> Residual {
+        let mut capacity = capacity_of(world);
+        let limit = |all: u32, limit: u32| if limit == 0 { all } else { all.min(limit) };
+        capacity.points = limit(capacity.points, limits.points);
+        capacity.cells = limit(capacity.cells, limits.cells);
+        let mut heap = SliceHeap::new(capacity);
+        for patch in 0..world.topology.patches() {
+            // The encoder's own copy is whole from the start.
+            let bytes = world.topology.patch(patch);
+            heap.slices()
+                .add_patch(patch, bytes)
+                .expect("there is room for all patches");
+        }
+        Residual {
+            mirror: Mirror::new(Heap::new(capacity)),
+            heap,
+            rate_hz: 60.0,
+            capacity,
+            quantiser,
+            limits,
+            has_patch: vec![has_patches; capacity.patches as usize],
+            due: vec![true; world.slices.len()],
+            seen: vec![0; world.slices.len()],
+            frames: 0,
+            fades: BTreeMap::new(),
+            space: Space::new(capacity.points),
+            debt: 0.0,
+        }
+    }
+
+    pub fn capacity(&self) -> Capacity {
+        self.capacity
+    }
+
+    pub fn reset(&mut self) {
+        self.mirror.reset();
+        self.mirror.clear_dirty();
+        self.heap.slices().reset(self.capacity.cells);
+        self.fades.clear();
+        self.space = Space::new(self.capacity.points);
+    }
+
+    pub fn merge(&mut self, world: &World) {
+        for (slice, due) in self.due.iter_mut().enumerate() {
+            *due |= world.has_changed(slice);
+        }
+    }
+
+    /// What was sent counts against the budget of this frame; what was too much, of the next.
+    pub fn spent(&mut self, bytes: u64) {
+        if self.limits.max_mbit > 0.0 {
+            self.debt = (self.debt + bytes as f64 - self.budget()).max(0.0);
+        }
+    }
+
+    /// Bytes a frame.
+    fn budget(&self) -> f64 {
+        self.limits.max_mbit * 1e6 / 8.0 / f64::from(self.rate_hz.max(1.0))
+    }
+
+    pub fn frame(&mut self, world: &World, view: &View<'_>, stats: &mut FrameStats) -> Packets {
+        self.frames += 1;
+        let mut room = if self.limits.max_mbit > 0.0 {
+            self.budget() - self.debt
+        } else {
+            f64::INFINITY
+        };
+        let lacks = self.lacks(world, view);
+        let mut out = Frame::default();
+        self.choose_levels(world, view, &lacks, room, &mut out);
+        // All of an instance's slices change level in one frame, so that none is missing.
+        let (mut now, mut later): (Vec<Lack>, Vec<Lack>) = (Vec::new(), Vec::new());
+        for lack in self.lacks(world, view) {
+            let fading = self.fades.get(&lack.index);
+            let whole = lack.opens && fading.is_some_and(|fade| fade.begun == self.frames);
+            if whole { &mut now } else { &mut later }.push(lack);
+        }
+        if room.is_finite() {
+            later.sort_by(|a, b| b.weight.total_cmp(&a.weight));
+        }
+        now.append(&mut later);
+        let mut chosen = Vec::new();
+        let mut rest = now.as_slice();
+        while !rest.is_empty() {
+            if room <= 0.0 {
+                stats.waiting = rest.len() as u32;
+                break;
+            }
+            let (batch, after) = rest.split_at(rest.len().min(BATCH));
+            rest = after;
+            self.choose(world, batch, &mut room, &mut chosen, &mut out, stats);
+        }
+        // In the order in which the client will take them, as cells come about in that order.
+        chosen.sort_unstable_by_key(|coded| coded.index);
+        for coded in chosen {
+            self.apply(world, coded, &mut out, stats);
+        }
+        let heap = self.heap.get();
+        self.fades
+            .retain(|&index, _| heap[index as usize].point_count > 0);
+        stats.closed = out.closes.len() as u32;
+        out.write(self, world, stats)
+    }
+
+    /// The slices in view that the client does not have, or that differ.
+    fn lacks(&mut self, world: &World, view: &View<'_>) -> Vec<Lack> {
+        let (frames, quantiser) = (self.frames, self.quantiser);
+        let (heap, due, fades) = (&self.heap, &self.due, &self.fades);
+        let mirror = &self.mirror;
+        let seen = &mut self.seen;
+        let lacks = world.slices.par_iter().zip(seen).enumerate();
+        lacks
+            .filter_map(|(index, (slice, seen))| {
+                if !(view.sees)(slice.bounds) {
+                    return None;
+                }
+                *seen = frames;
+                let open = &heap.get()[index];
+                let opens = open.point_count == 0;
+                let fading = fades.contains_key(&(index as u32));
+                if !(opens || due[index] || fading) {
+                    return None;
+                }
+                let want = world.occlusion(slice).iter();
+                let squares: u64 = if opens {
+                    // What is missing reads as open. At equal error, new slices first.
+                    want.map(|w| u64::from(255 - w).pow(2)).sum::<u64>() + want_a_little(slice)
+                } else {
+                    let level = mirror.instances()[slice.instance as usize].level;
+                    let have = heap.values(open).iter();
+                    let levels = world.levels(slice).iter();
+                    let want = want
+                        .zip(levels)
+                        .filter(|(_, has)| u32::from(**has) >= level);
+                    let off = want.zip(have).map(|((w, _), h)| w.abs_diff(*h));
+                    let off = off.filter(|off| *off > quantiser.dead_zone);
+                    off.map(|off| u64::from(off).pow(2)).sum()
+                };
+                let shows = !opens && to_show(world, mirror, slice, open) != open.shown;
+                if squares == 0 && !shows && !fading {
+                    return None;
+                }
+                let near = view
+                    .eye
+                    .map_or(1.0, |eye| distance(eye.position, slice.bounds).max(0.5));
+                Some(Lack {
+                    index: index as u32,
+                    opens,
+                    weight: (squares as f32 + f32::from(u8::from(shows))) / (near * near),
+                })
+            })
+            .collect()
+    }
+
+    /// Gives instances the level of detail that their distance asks for.
+    fn choose_levels(
+        &mut self,
+        world: &World,
+        view: &View<'_>,
+        lacks: &[Lack],
+        room: f64,
+        out: &mut Frame,
+    ) {
+        let mut nearest: BTreeMap<u32, f32> = BTreeMap::new();
+        for (index, slice) in world.slices.iter().enumerate() {
+            if self.seen[index] == self.frames {
+                let far = view
+                    .eye
+                    .map_or(0.0, |eye| distance(eye.position, slice.bounds));
+                let least = nearest.entry(slice.instance).or_insert(f32::INFINITY);
+                *least = least.min(far);
+            }
+        }
+        let mut opening: Vec<u32> = lacks
+            .iter()
+            .filter(|lack| lack.opens)
+            .map(|lack| world.slices[lack.index as usize].instance)
+            .collect();
+        opening.dedup();
+        for (instance, far) in nearest {
+            let Some(base) = world.level_of(instance) else {
+                continue;
+            };
+            let has = self.mirror.instances()[instance as usize];
+            let placed = has.bucket_count > 0;
+            let from = if placed { has.level } else { base };
+            let level = self.level_at(world, view, base, from, far);
+            if placed && level == has.level {
+                continue;
+            }
+            if !placed && !opening.contains(&instance) {
+                continue;
+            }
+            let grid = world.grid(instance, level);
+            let slices = world.slices_of(instance);
+            let open: Vec<u32> = slices
+                .clone()
+                .filter(|&slice| self.heap.get()[slice as usize].point_count > 0)
+                .collect();
+            if open.is_empty() {
+                self.set_instance(instance, grid, out);
+                continue;
+            }
+            // Three bits a point, all in this frame.
+            let points: usize = slices.map(|s| world.slices[s as usize].points.len()).sum();
+            if room.is_finite() && points as f64 * 3.0 / 8.0 > room {
+                continue;
+            }
+            self.change_level(world, instance, grid, &open, out);
+        }
+    }
+
+    /// The level for a distance in metres: the coarsest with enough points a pixel. A little
+    /// farther is needed to lose points than to gain them.
+    fn level_at(&self, world: &World, view: &View<'_>, base: u32, from: u32, far: f32) -> u32 {
+        let Some(eye) = view.eye else { return base };
+        let pixels = (eye.pixels_per_radian / far.max(1e-3)).powi(2);
+        let wanted = self.limits.points_per_pixel * pixels;
+        if wanted <= 0.0 {
+            return base;
+        }
+        let halvings = (world.options.density as f32 / wanted).log2();
+        let mut level = from;
+        while level > base && halvings < (level - base) as f32 {
+            level -= 1;
+        }
+        while level + 1 < LEVELS && halvings >= (level - base) as f32 + 1.25 {
+            level += 1;
+        }
+        level
+    }
+
+    fn set_instance(&mut self, instance: u32, grid: Instance, out: &mut Frame) {
+        self.mirror
+            .set_instance(instance, grid)
+            .expect("own grids are usable");
+        out.instances.push((instance, grid));
+    }
+
+    /// Closes an instance's slices, and notes what its points at the new level begin with: what
+    /// the client's picture shows there now.
+    fn change_level(
+        &mut self,
+        world: &World,
+        instance: u32,
+        grid: Instance,
+        open: &[u32],
+        out: &mut Frame,
+    ) {
+        let lookup = self.mirror.lookup();
+        let kernel = world.options.kernel;
+        let fades: Vec<(u32, Fade)> = open
+            .par_iter()
+            .map(|&index| {
+                let slice = &world.slices[index as usize];
+                let numbers = slice.points.clone().zip(world.levels(slice));
+                let of_level = numbers.filter(|(_, has)| u32::from(**has) >= grid.level);
+                let shown = of_level.map(|(number, _)| {
+                    let (position, normal) = world.grid_point(instance, number);
+                    let (position, normal) = (position.to_array(), normal.to_array());
+                    let answer = lookup.blend(kernel, instance, position, normal);
+                    (answer.openness * 255.0 + 0.5) as u8
+                });
+                let fade = Fade {
+                    from: shown.collect(),
+                    begun: self.frames,
+                };
+                (index, fade)
+            })
+            .collect();
+        for &index in open {
+            self.close(index, out);
+        }
+        self.fades.extend(fades);
+        self.set_instance(instance, grid, out);
+    }
+
+    fn close(&mut self, index: u32, out: &mut Frame) {
+        let slice = self.heap.get()[index as usize];
+        let first = slice.point_first;
+        self.space.free(first..first + slice.point_count);
+        let mut slices = self.heap.slices();
+        slices
+            .close(&mut self.mirror, index)
+            .expect("open slices close");
+        self.due[index as usize] = true;
+        out.closes.push(index);
+    }
+
+    /// What a slice's points should say at the client now.
+    fn target(&self, world: &World, index: u32) -> Vec<u8> {
+        let slice = &world.slices[index as usize];
+        let level = self.mirror.instances()[slice.instance as usize].level;
+        let points = world.occlusion(slice).iter().zip(world.levels(slice));
+        let of_level = points.filter(|(_, has)| u32::from(**has) >= level);
+        let mut target: Vec<u8> = of_level.map(|(occlusion, _)| *occlusion).collect();
+        if let Some(fade) = self.fades.get(&index) {
+            let done = (self.frames - fade.begun) as f32 / (FADE_S * self.rate_hz).max(1.0);
+            for (to, from) in target.iter_mut().zip(&fade.from) {
+                let (from, to_f) = (f32::from(*from), f32::from(*to));
+                *to = (from + (to_f - from) * done.min(1.0)).round() as u8;
+            }
+        }
+        target
+    }
+
+    /// Codes slices until there is no more room.
+    fn choose(
+        &mut self,
+        world: &World,
+        batch: &[Lack],
+        room: &mut f64,
+        chosen: &mut Vec<Coded>,
+        out: &mut Frame,
+        stats: &mut FrameStats,
+    ) {
+        let mut ready: Vec<(u32, Option<[u32; 3]>)> = Vec::new();
+        for lack in batch {
+            if lack.opens {
+                let opens = self.open(world, lack.index, out);
+                ready.extend(opens.map(|opens| (lack.index, Some(opens))));
+            } else {
+                let mut slices = self.heap.slices();
+                slices
+                    .prepare(&self.mirror, lack.index)
+                    .expect("own slices are open");
+                ready.push((lack.index, None));
+            }
+        }
+        let coded: Vec<Coded> = ready
+            .par_iter()
+            .map(|&(index, opens)| self.code(world, index, opens))
+            .collect();
+        for coded in coded {
+            if *room <= 0.0 {
+                stats.waiting += 1;
+                if coded.opens.is_some() {
+                    self.forget(coded.index);
+                }
+                continue;
+            }
+            *room -= (coded.bytes.len() + 4) as f64;
+            if let Some([_, patch, _]) = coded.opens
+                && !self.has_patch[patch as usize]
+            {
+                self.has_patch[patch as usize] = true;
+                *room -= world.topology.patch(patch).len() as f64;
+                out.patches.push(patch);
+            }
+            chosen.push(coded);
+        }
+    }
+
+    /// Brings the encoder's own mirror to where the client's will be.
+    fn apply(&mut self, world: &World, coded: Coded, out: &mut Frame, stats: &mut FrameStats) {
+        let index = coded.index;
+        let slice = self.heap.get()[index as usize];
+        let shown = to_show(world, &self.mirror, &world.slices[index as usize], &slice);
+        let mut slices = self.heap.slices();
+        let (_, state) = slices.side(&slice).expect("own slices are open");
+        let before = state.value.to_vec();
+        state.value.copy_from_slice(&coded.values);
+        state.last.copy_from_slice(&coded.last);
+        slices
+            .settle(&mut self.mirror, index, &before, shown)
+            .expect("own slices are open");
+        let operation = match coded.opens {
+            Some(opens) => Operation::Open(opens, shown),
+            None if shown != slice.shown => Operation::Show(shown),
+            None => Operation::Update,
+        };
+        stats.opened += u32::from(coded.opens.is_some());
+        stats.slices += 1;
+        out.items
+            .push((index, operation, slice.point_count, coded.bytes));
+        let fading = self
+            .fades
+            .get(&index)
+            .is_some_and(|fade| self.frames - fade.begun < (FADE_S * self.rate_hz).ceil() as u64);
+        if !fading {
+            self.fades.remove(&index);
+            self.due[index as usize] = false;
+        }
+    }
+
+    /// Opens a slice at the encoder; others make room if they are out of view. No cell changes
+    /// yet. Returns what the item says of it, if there is room.
+    fn open(&mut self, world: &World, index: u32, out: &mut Frame) -> Option<[u32; 3]> {
+        let slice = &world.slices[index as usize];
+        let level = self.mirror.instances()[slice.instance as usize].level;
+        let has = world
+            .levels(slice)
+            .iter()
+            .filter(|has| u32::from(**has) >= level);
+        let count = has.count() as u32;
+        let first = loop {
+            let cells_free = self.limits.cells == 0 || self.free_cells() >= count;
+            if count == 0 {
+                return None;
+            }
+            if cells_free && let Some(first) = self.space.take(count) {
+                break first;
+            }
+            let heap = self.heap.get();
+            let idle = (0..heap.len() as u32).filter(|&other| {
+                heap[other as usize].point_count > 0 && self.seen[other as usize] < self.frames
+            });
+            let oldest = idle.min_by_key(|&other| self.seen[other as usize])?;
+            self.close(oldest, out);
+        };
+        let mut slices = self.heap.slices();
+        let opens = [slice.instance, slice.patch, first];
+        slices
+            .open(&self.mirror, index, opens)
+            .expect("own slices open");
+        Some(opens)
+    }
+
+    /// Undoes [`Residual::open`].
+    fn forget(&mut self, index: u32) {
+        let slice = self.heap.get()[index as usize];
+        self.space
+            .free(slice.point_first..slice.point_first + slice.point_count);
+        let mut slices = self.heap.slices();
+        slices
+            .close(&mut self.mirror, index)
+            .expect("open slices close");
+    }
+
+    fn free_cells(&mut self) -> u32 {
+        let free = self.heap.slices().free;
+        let words = (self.capacity.cells as usize).div_ceil(64);
+        free[..words].iter().map(|word| word.count_ones()).sum()
+    }
+
+    fn code(&self, world: &World, index: u32, opens: Option<[u32; 3]>) -> Coded {
+        let slice = self.heap.get()[index as usize];
+        let target = self.target(world, index);
+        let mut coded = Coded {
+            index,
+            opens,
+            values: self.heap.values(&slice).to_vec(),
+            last: self.heap.last(&slice).to_vec(),
+            bytes: vec![0; MAX_SLICE_BYTES],
+        };
+        let mut state = SliceState {
+            value: &mut coded.values,
+            last: &mut coded.last,
+        };
+        let quantiser = if opens.is_some() {
+            FIRST
+        } else {
+            self.quantiser
+        };
+        let length = encode_slice(
+            self.heap.neighbours(&slice),
+            quantiser,
+            &mut state,
+            &target,
+            opens.is_some(),
+            &mut coded.bytes,
+        )
+        .expect("a slice has the room asked for");
+        coded.bytes.truncate(length);
+        coded
+    }
+
+    /// Bodies of patches packets.
+    pub fn patches(&self, world: &World, indices: &[u32]) -> Vec<Vec<u8>> {
+        let mut bodies = Bodies::default();
+        for &index in indices {
+            let bytes = world.topology.patch(index);
+            bodies.add(index, bytes.len() + 10, |next, w| {
+                w.varint(index - next)?;
+                w.varint(bytes.len() as u32)?;
+                w.bytes(bytes)
+            });
+        }
+        bodies.0.into_iter().map(|(body, _)| body).collect()
+    }
+}
+
+/// The blocks that the client should have in cells. Blocks go only when there are many, as each
+/// coming and going costs the client time.
+fn to_show(world: &World, mirror: &Mirror<Heap>, slice: &Slice, open: &slices::Slice) -> u64 {
+    let level = mirror.instances()[slice.instance as usize].level;
+    if Some(level) != world.level_of(slice.instance) {
+        return open.all_blocks();
+    }
+    let wanted = world.shown(slice) & open.all_blocks();
+    let idle = (open.shown & !wanted).count_ones();
+    let many = idle * 4 >= open.all_blocks().count_ones();
+    if many { wanted } else { wanted | open.shown }
+}
+
+/// A slice without darkness is still a little better had than not.
+fn want_a_little(slice: &Slice) -> u64 {
+    slice.points.len() as u64
+}
+
+/// From a point to a box, metres.
+fn distance(from: Vec3, [min, max]: [Vec3; 2]) -> f32 {
+    from.distance(from.clamp(min, max))
+}
+
+/// A frame being put together.
+#[derive(Default)]
+struct Frame {
+    closes: Vec<u32>,
+    instances: Vec<(u32, Instance)>,
+    patches: Vec<u32>,
+    items: Vec<(u32, Operation, u32, Vec<u8>)>,
+}
+
+impl Frame {
+    fn write(mut self, sent: &Residual, world: &World, stats: &mut FrameStats) -> Packets {
+        stats.instances = self.instances.len() as u32;
+        stats.patches = self.patches.len() as u32;
+        self.patches.sort_unstable();
+        self.instances.sort_unstable_by_key(|(index, _)| *index);
+        let mut closes = Bodies::default();
+        for &index in &self.closes {
+            let item = Item {
+                index,
+                operation: Operation::Close,
+                points: 0,
+                bytes: &[],
+            };
+            closes.add(index, ITEM_HEADER_BYTES, |next, w| item.write(next, w));
+        }
+        let mut items = Bodies::default();
+        for (index, operation, points, bytes) in &self.items {
+            let item = Item {
+                index: *index,
+                operation: *operation,
+                points: *points,
+                bytes,
+            };
+            let room = ITEM_HEADER_BYTES + bytes.len();
+            items.add(*index, room, |next, w| item.write(next, w));
+        }
+        let mut packets = closes.packets();
+        if !self.instances.is_empty() {
+            let mut raw = vec![0; CHANGES_HEADER_BYTES + self.instances.len() * 68];
+            write_content(&mut Writer::new(&mut raw), &self.instances, &[], &[])
+                .expect("content has the room counted");
+            let compressed = compress(&mut compressor(Compression::Fast), &raw);
+            packets.push((kind::FRAME, raw.len(), compressed));
+        }
+        packets.append(&mut items.packets());
+        Packets {
+            patches: sent.patches(world, &self.patches),
+            packets,
+        }
+    }
+}
+
+/// Contents of packets, cut at [`PACKET_BYTES`]; and the index after the last in each.
+#[derive(Default)]
+struct Bodies(Vec<(Vec<u8>, u32)>);
+
+impl Bodies {
+    /// Adds what `write` writes, which is told the index after the last in the packet.
+    fn add(
+        &mut self,
+        index: u32,
+        room: usize,
+        write: impl FnOnce(u32, &mut Writer<'_>) -> Result<(), psao_core::stream::StreamError>,
+    ) {
+        // What comes out of order begins another packet.
+        let full =
+            |(body, next): &(Vec<u8>, u32)| body.len() + room > PACKET_BYTES || index < *next;
+        if self.0.last().is_none_or(full) {
+            self.0.push((Vec::new(), 0));
+        }
+        let (body, next) = self.0.last_mut().expect("one was just made");
+        let start = body.len();
+        body.resize(start + room, 0);
+        let mut writer = Writer::new(&mut body[start..]);
+        write(*next, &mut writer).expect("it has the room asked for");
+        let length = writer.length();
+        body.truncate(start + length);
+        *next = index + 1;
+    }
+
+    fn packets(self) -> Vec<(u8, usize, Vec<u8>)> {
+        let bodies = self.0.into_iter();
+        bodies
+            .map(|(body, _)| (kind::SLICES, body.len(), body))
+            .collect()
+    }
+}
+
+/// Memory for points' side data, given out in runs.
+#[derive(Debug)]
+struct Space {
+    /// Sorted, apart from one another, none empty.
+    free: Vec<Range<u32>>,
+}
+
+impl Space {
+    fn new(points: u32) -> Space {
+        Space {
+            free: Vec::from_iter((points > 0).then_some(0..points)),
+        }
+    }
+
+    /// The first place with room for `count`.
+    fn take(&mut self, count: u32) -> Option<u32> {
+        let at = self
+            .free
+            .iter()
+            .position(|run| run.end - run.start >= count)?;
+        let first = self.free[at].start;
+        self.free[at].start += count;
+        if self.free[at].is_empty() {
+            self.free.remove(at);
+        }
+        Some(first)
+    }
+
+    fn free(&mut self, run: Range<u32>) {
+        let at = self.free.partition_point(|other| other.start < run.start);
+        self.free.insert(at, run);
+        if at + 1 < self.free.len() && self.free[at].end == self.free[at + 1].start {
+            self.free[at].end = self.free[at + 1].end;
+            self.free.remove(at + 1);
+        }
+        if at > 0 && self.free[at - 1].end == self.free[at].start {
+            self.free[at - 1].end = self.free[at].end;
+            self.free.remove(at);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn space_is_given_out_once_and_grows_together_again() {
+        let mut space = Space::new(100);
+        let runs: Vec<u32> = (0..10).map(|_| space.take(10).unwrap()).collect();
+        assert_eq!(space.take(1), None);
+        for index in [3, 7, 5, 4, 0, 9, 8, 1, 6, 2] {
+            let first = runs[index];
+            space.free(first..first + 10);
+        }
+        assert_eq!(space.free, [0..100]);
+    }
+}

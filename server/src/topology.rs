@@ -1,0 +1,339 @@
+//! Topology of profile `residual`: each mesh's points once, in patches that its instances share.
+
+use crate::points::{SurfacePoint, morton_order};
+use crate::scene::Mesh;
+use crate::truth::{Placement, buckets_for, choose_buckets};
+use glam::Vec3;
+use psao_core::Instance;
+use psao_core::bins::{Bin, SCALES};
+use psao_core::cell::CELL_POINTS;
+use psao_core::residual::BLOCK;
+use psao_core::topology::{LEVELS, MAX_PATCH_BYTES, Order, PATCH_POINTS, PatchPoint, encode_patch};
+use rayon::prelude::*;
+use std::collections::HashMap;
+use std::hash::{BuildHasherDefault, Hasher};
+use std::ops::Range;
+
+/// The points of a mesh (for instances whose scales have the same ratios).
+#[derive(Clone, Debug)]
+pub struct PointSet {
+    /// Its patches, coded.
+    pub patches: Vec<Vec<u8>>,
+    /// The points of all patches, one after the other.
+    pub points: Vec<SurfacePoint>,
+    /// The same as the stream has them.
+    pub coded: Vec<PatchPoint>,
+    /// The grid at each level, without a place in the bucket buffer.
+    pub levels: Vec<Level>,
+}
+
+/// A set's grid at a level of detail.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Level {
+    /// Its `bucket_first` is 0.
+    pub grid: Instance,
+    /// Cells with points.
+    pub cells: usize,
+    /// Points that find no room in their cell or bucket.
+    pub discarded: usize,
+}
+
+impl PointSet {
+    /// Patches of a mesh's points, which come in progressive order; `grid` is that of level 0,
+    /// around all of them. `None` if there are no points.
+    pub fn new(mesh: &Mesh, points: &[SurfacePoint], grid: &Instance) -> Option<PointSet> {
+        let local: Vec<Vec3> = points
+            .iter()
+            .map(|p| p.position(&mesh.triangles, &mesh.positions))
+            .collect();
+        let bounds = local
+            .iter()
+            .fold([Vec3::INFINITY, Vec3::NEG_INFINITY], |[min, max], p| {
+                [min.min(*p), max.max(*p)]
+            });
+        let coded = |index: u32| {
+            let point = &points[index as usize];
+            let normal = point.normal(&mesh.triangles, &mesh.positions, &mesh.normals);
+            let at = Placement::of(grid, local[index as usize], normal)?;
+            let mut coded = PatchPoint {
+                normal: at.normal,
+                level: level_of_rank(index as usize, points.len()),
+                ..PatchPoint::default()
+            };
+            for axis in 0..3 {
+                coded.position[axis] = at.cell[axis] * 32 + at.position[axis];
+            }
+            Some((coded, *point))
+        };
+        let all: Vec<(PatchPoint, SurfacePoint)> = morton_order(&local, bounds)
+            .into_iter()
+            .filter_map(coded)
+            .collect();
+        let patches: Vec<(Vec<u8>, Vec<(PatchPoint, SurfacePoint)>)> = all
+            .par_chunks(PATCH_POINTS)
+            .map(|chunk| {
+                let mut chunk = chunk.to_vec();
+                let only: Vec<PatchPoint> = chunk.iter().map(|(coded, _)| *coded).collect();
+                let order = Order::of(&only);
+                chunk.sort_by_key(|(coded, _)| order.key(coded));
+                let only: Vec<PatchPoint> = chunk.iter().map(|(coded, _)| *coded).collect();
+                let mut bytes = vec![0; MAX_PATCH_BYTES];
+                let length = encode_patch(&only, &mut bytes).expect("a patch has room and order");
+                bytes.truncate(length);
+                bytes.shrink_to_fit();
+                (bytes, chunk)
+            })
+            .collect();
+        let mut set = PointSet {
+            patches: Vec::with_capacity(patches.len()),
+            points: Vec::with_capacity(all.len()),
+            coded: Vec::with_capacity(all.len()),
+            levels: Vec::new(),
+        };
+        for (bytes, chunk) in patches {
+            set.patches.push(bytes);
+            for (coded, point) in chunk {
+                set.coded.push(coded);
+                set.points.push(point);
+            }
+        }
+        set.levels = (0..LEVELS)
+            .into_par_iter()
+            .map(|level| lay_out(&set.coded, grid, level))
+            .collect();
+        (!set.coded.is_empty()).then_some(set)
+    }
+
+    /// The points of a patch, as numbers within the set.
+    pub fn patch_range(&self, patch: usize) -> Range<usize> {
+        let first = patch * PATCH_POINTS;
+        first..(first + PATCH_POINTS).min(self.coded.len())
+    }
+}
+
+/// The highest level that has a point: each level has half of the points of the one below.
+fn level_of_rank(rank: usize, count: usize) -> u8 {
+    let has = |level: &u32| rank < count.div_ceil(1 << level);
+    (1..LEVELS).take_while(has).count() as u8
+}
+
+/// A level's grid, with buckets for the cells that its points fall into.
+fn lay_out(points: &[PatchPoint], level_0: &Instance, level: u32) -> Level {
+    let scale = SCALES[level as usize];
+    let factor = scale as f32 / SCALES[0] as f32;
+    let mut grid = Instance {
+        cells_per_unit: level_0.cells_per_unit.map(|cells| cells * factor),
+        dims: level_0
+            .dims
+            .map(|dim| ((u64::from(dim) * u64::from(scale)) >> 16) as u32 + 1),
+        level,
+        ..*level_0
+    };
+    if level == 0 {
+        grid.dims = level_0.dims;
+    }
+    let bins = bins_of(points, &grid);
+    let mut loads: HashMap<[u32; 3], u32, Fast> = HashMap::default();
+    for bin in bins {
+        *loads.entry(bin.cell).or_default() += 1;
+    }
+    let cells: Vec<[u32; 3]> = loads.keys().copied().collect();
+    grid.bucket_count = choose_buckets(&grid, &cells, buckets_for(cells.len()));
+    let over = loads
+        .values()
+        .map(|&load| (load as usize).saturating_sub(CELL_POINTS));
+    Level {
+        grid,
+        cells: cells.len(),
+        discarded: over.sum(),
+    }
+}
+
+fn bins_of<'a>(points: &'a [PatchPoint], grid: &'a Instance) -> impl Iterator<Item = Bin> + 'a {
+    points
+        .iter()
+        .filter(|point| u32::from(point.level) >= grid.level)
+        .filter_map(|point| Bin::of(grid, point))
+}
+
+/// Which blocks of a set's slices (of [`BLOCK`] points, at a level) lie so near one another that
+/// one must be in the client's cells when the other has a dark point: those that share a cell or
+/// have cells side by side.
+#[derive(Clone, Debug, Default)]
+pub struct Adjacency {
+    first: Vec<u32>,
+    blocks: Vec<u32>,
+}
+
+impl Adjacency {
+    /// Of the slices that a set's patches are at a level. Blocks are numbered through, slice by
+    /// slice, each slice beginning at a multiple of [`SLICE_BLOCKS`].
+    pub fn new(set: &PointSet, level: u32) -> Adjacency {
+        let grid = &set.levels[level as usize].grid;
+        let mut of_cell: HashMap<[u32; 3], Vec<u32>, Fast> = HashMap::default();
+        let mut cells: Vec<Vec<[u32; 3]>> = vec![Vec::new(); set.patches.len() * SLICE_BLOCKS];
+        for patch in 0..set.patches.len() {
+            let points = set.coded[set.patch_range(patch)].iter();
+            let of_level = points.filter(|point| u32::from(point.level) >= level);
+            for (at, point) in of_level.enumerate() {
+                let Some(bin) = Bin::of(grid, point) else {
+                    continue;
+                };
+                let block = patch * SLICE_BLOCKS + at / BLOCK;
+                if !cells[block].contains(&bin.cell) {
+                    cells[block].push(bin.cell);
+                    of_cell.entry(bin.cell).or_default().push(block as u32);
+                }
+            }
+        }
+        let near: Vec<Vec<u32>> = cells
+            .par_iter()
+            .map(|cells| {
+                let mut near = Vec::new();
+                let mut around = Vec::new();
+                for cell in cells {
+                    for offset in 0..27u32 {
+                        let by = [offset % 3, offset / 3 % 3, offset / 9];
+                        let at: [u32; 3] =
+                            std::array::from_fn(|i| (cell[i] + by[i]).wrapping_sub(1));
+                        around.push(at);
+                    }
+                }
+                around.sort_unstable();
+                around.dedup();
+                for cell in around {
+                    near.extend(of_cell.get(&cell).into_iter().flatten());
+                }
+                near.sort_unstable();
+                near.dedup();
+                near
+            })
+            .collect();
+        let mut adjacency = Adjacency::default();
+        adjacency.first.push(0);
+        for near in near {
+            adjacency.blocks.extend(near);
+            adjacency.first.push(adjacency.blocks.len() as u32);
+        }
+        adjacency
+    }
+
+    /// How many blocks there are.
+    pub fn blocks(&self) -> usize {
+        self.first.len() - 1
+    }
+
+    /// The blocks near one, itself among them.
+    pub fn near(&self, block: usize) -> &[u32] {
+        &self.blocks[self.first[block] as usize..self.first[block + 1] as usize]
+    }
+}
+
+/// Most blocks of a slice.
+pub const SLICE_BLOCKS: usize = PATCH_POINTS / BLOCK;
+
+/// Hashes of cells: their coordinates are no attacker's.
+type Fast = BuildHasherDefault<CellHasher>;
+
+#[derive(Default)]
+struct CellHasher(u64);
+
+impl Hasher for CellHasher {
+    fn finish(&self) -> u64 {
+        self.0
+    }
+
+    fn write(&mut self, bytes: &[u8]) {
+        for chunk in bytes.chunks(8) {
+            let mut word = [0; 8];
+            word[..chunk.len()].copy_from_slice(chunk);
+            let mixed = (self.0 ^ u64::from_le_bytes(word)).wrapping_mul(0x9e37_79b9_7f4a_7c15);
+            self.0 = mixed ^ mixed >> 29;
+        }
+    }
+}
+
+/// All point sets of a scene, and which instance has which.
+#[derive(Clone, Debug, Default)]
+pub struct Topology {
+    /// All sets.
+    pub sets: Vec<PointSet>,
+    /// The first patch of each set.
+    pub first_patch: Vec<u32>,
+    /// Each instance's set, and the level that its scale asks for: its points are those of that
+    /// level and above.
+    pub of_instance: Vec<Option<(u32, u32)>>,
+    /// Tells this topology from others.
+    pub hash: u64,
+    patches: u32,
+    bytes: u32,
+}
+
+impl Topology {
+    /// Numbers the patches of all sets.
+    pub fn new(sets: Vec<PointSet>, of_instance: Vec<Option<(u32, u32)>>) -> Topology {
+        let mut topology = Topology {
+            of_instance,
+            ..Topology::default()
+        };
+        let mut hash = 0xcbf2_9ce4_8422_2325u64;
+        for set in &sets {
+            topology.first_patch.push(topology.patches);
+            topology.patches += set.patches.len() as u32;
+            for patch in &set.patches {
+                topology.bytes += patch.len() as u32;
+                for byte in patch {
+                    hash = (hash ^ u64::from(*byte)).wrapping_mul(0x100_0000_01b3);
+                }
+            }
+        }
+        topology.hash = hash;
+        topology.sets = sets;
+        topology
+    }
+
+    /// How many patches there are.
+    pub fn patches(&self) -> u32 {
+        self.patches
+    }
+
+    /// Bytes of all patches together.
+    pub fn bytes(&self) -> u32 {
+        self.bytes
+    }
+
+    /// A patch's bytes.
+    pub fn patch(&self, index: u32) -> &[u8] {
+        let set = self.first_patch.partition_point(|first| *first <= index) - 1;
+        &self.sets[set].patches[(index - self.first_patch[set]) as usize]
+    }
+
+    /// The set of an instance, if it has points.
+    pub fn set_of(&self, instance: u32) -> Option<&PointSet> {
+        let (set, _) = self.of_instance[instance as usize]?;
+        Some(&self.sets[set as usize])
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use psao_core::topology::decode_patch;
+
+    #[test]
+    fn each_level_has_half_of_the_points_of_the_one_below() {
+        let counts = |count: usize| -> Vec<usize> {
+            let levels: Vec<u8> = (0..count).map(|rank| level_of_rank(rank, count)).collect();
+            (0..LEVELS as u8)
+                .map(|level| levels.iter().filter(|&&l| l >= level).count())
+                .collect()
+        };
+        assert_eq!(counts(800), [800, 400, 200, 100]);
+        assert_eq!(counts(1), [1, 1, 1, 1]);
+        assert_eq!(counts(3), [3, 2, 1, 1]);
+        let mut points = [PatchPoint::default(); PATCH_POINTS];
+        let mut bytes = vec![0; MAX_PATCH_BYTES];
+        let length = encode_patch(&points[..3], &mut bytes).unwrap();
+        assert_eq!(decode_patch(&bytes[..length], &mut points), Ok(3));
+    }
+}
