@@ -573,7 +573,8 @@ const char *psao_result_str(int32_t result);
  *
  * out: capacity_bytes; PSAO_UPLINK_SMALL_BYTES are enough. out_bytes: how long the message is.
  *
- * PSAO_ERROR_VALUE: the token is too long. PSAO_ERROR_OUTPUT_SIZE: out is too small.
+ * PSAO_ERROR_VALUE: the token is too long. PSAO_ERROR_OUTPUT_SIZE: out is too small; what is in
+ * it is then undefined.
  *
  * Threads: exclusive per psao_uplink. No alloc, lock or log. Since ABI 1. */
 psao_result psao_uplink_hello(struct psao_uplink *uplink,

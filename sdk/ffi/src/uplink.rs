@@ -12,39 +12,32 @@ pub const PSAO_UPLINK_MAX_BYTES: u32 = 196632;
 /// The longest message of any other psao_uplink_ function.
 pub const PSAO_UPLINK_SMALL_BYTES: u32 = 384;
 
-/// Bodies' lengths: docs/format.md, 10.3 to 10.6. The hello's without the token.
-const HELLO_BYTES: usize = 50;
-const CAMERA_BYTES: usize = 60;
-const TRANSFORM_BYTES: usize = 100;
-
 const _: () = assert!(
     PSAO_UPLINK_MAX_BYTES == PACKET_HEADER_BYTES as u32 + uplink::MAX_UPLINK_BODY_BYTES - 8
 );
 
-/// Writes one message of a known length; all values were checked before.
+/// Writes one message; all values were checked before, so that only room can be missing.
 ///
 /// # Safety
 /// The pointers are as the functions below describe.
 unsafe fn message(
     uplink: *mut psao_uplink,
-    out: (*mut u8, usize, *mut usize),
+    (out, capacity_bytes, out_bytes): (*mut u8, usize, *mut usize),
     kind: u8,
-    body_bytes: usize,
     body: impl FnOnce(&mut Writer<'_>) -> Result<(), StreamError>,
 ) -> Result<psao_result, psao_result> {
-    let (out, capacity_bytes, out_bytes) = out;
     if uplink.is_null() || out.is_null() || out_bytes.is_null() {
         return Err(PSAO_ERROR_NULL);
     }
-    let length = PACKET_HEADER_BYTES + body_bytes;
-    if capacity_bytes < length {
-        return Err(PSAO_ERROR_OUTPUT_SIZE);
-    }
-    // SAFETY: not null; the caller's word for the rest, and the length is within its capacity.
+    let room = capacity_bytes.min(PSAO_UPLINK_MAX_BYTES as usize);
+    // SAFETY: not null, and the caller's word for the rest.
     unsafe {
         let sequence = (*uplink).next_sequence;
-        let out = std::slice::from_raw_parts_mut(out, length);
-        let written = write_packet(out, kind, 0, sequence, body)?;
+        let out = std::slice::from_raw_parts_mut(out, room);
+        let written = match write_packet(out, kind, 0, sequence, body) {
+            Err(StreamError::Length) => return Err(PSAO_ERROR_OUTPUT_SIZE),
+            written => written?,
+        };
         (*uplink).next_sequence = sequence.wrapping_add(1);
         put(out_bytes, written)?;
     }
@@ -60,7 +53,8 @@ unsafe fn message(
 ///
 /// out: capacity_bytes; PSAO_UPLINK_SMALL_BYTES are enough. out_bytes: how long the message is.
 ///
-/// PSAO_ERROR_VALUE: the token is too long. PSAO_ERROR_OUTPUT_SIZE: out is too small.
+/// PSAO_ERROR_VALUE: the token is too long. PSAO_ERROR_OUTPUT_SIZE: out is too small; what is in
+/// it is then undefined.
 ///
 /// Threads: exclusive per psao_uplink. No alloc, lock or log. Since ABI 1.
 ///
@@ -95,9 +89,7 @@ pub unsafe extern "C" fn psao_uplink_hello(
         }
         let mut first = psao_uplink::default();
         let out = (out, capacity_bytes, out_bytes);
-        let result = message(&mut first, out, kind::HELLO, 26 + token.len(), |w| {
-            hello.write(w)
-        })?;
+        let result = message(&mut first, out, kind::HELLO, |w| hello.write(w))?;
         uplink.write(first);
         Ok(result)
     })
@@ -135,7 +127,7 @@ pub unsafe extern "C" fn psao_uplink_camera(
             return Err(PSAO_ERROR_VALUE);
         }
         let out = (out, capacity_bytes, out_bytes);
-        message(uplink, out, kind::CAMERA, CAMERA_BYTES, |w| camera.write(w))
+        message(uplink, out, kind::CAMERA, |w| camera.write(w))
     })
 }
 
@@ -175,9 +167,7 @@ pub unsafe extern "C" fn psao_uplink_transform(
             world_from_local: *world_from_local,
         };
         let out = (out, capacity_bytes, out_bytes);
-        message(uplink, out, kind::TRANSFORM, TRANSFORM_BYTES, |w| {
-            transform.write(w)
-        })
+        message(uplink, out, kind::TRANSFORM, |w| transform.write(w))
     })
 }
 
@@ -215,7 +205,7 @@ pub unsafe extern "C" fn psao_uplink_joints(
             return Err(PSAO_ERROR_VALUE);
         }
         let out = (out, capacity_bytes, out_bytes);
-        message(uplink, out, kind::JOINTS, 8 + 48 * joints.len(), |w| {
+        message(uplink, out, kind::JOINTS, |w| {
             uplink::write_joints(w, instance_index, joints)
         })
     })
@@ -239,7 +229,7 @@ pub unsafe extern "C" fn psao_uplink_ack(
 ) -> psao_result {
     let out = (out, capacity_bytes, out_bytes);
     // SAFETY: the caller's word.
-    guarded(|| unsafe { message(uplink, out, kind::ACK, 4, |w| w.u32(frame_id)) })
+    guarded(|| unsafe { message(uplink, out, kind::ACK, |w| w.u32(frame_id)) })
 }
 
 /// Writes that you need a snapshot, after PSAO_RESYNC.
@@ -257,5 +247,5 @@ pub unsafe extern "C" fn psao_uplink_resync(
 ) -> psao_result {
     let out = (out, capacity_bytes, out_bytes);
     // SAFETY: the caller's word.
-    guarded(|| unsafe { message(uplink, out, kind::RESYNC, 0, |_| Ok(())) })
+    guarded(|| unsafe { message(uplink, out, kind::RESYNC, |_| Ok(())) })
 }
