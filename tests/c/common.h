@@ -31,7 +31,7 @@ typedef struct bytes {
     size_t size;
 } bytes;
 
-static bytes read_file(const char *path) {
+static inline bytes read_file(const char *path) {
     bytes file = {NULL, 0};
     FILE *stream = fopen(path, "rb");
     long length;
@@ -46,7 +46,7 @@ static bytes read_file(const char *path) {
     return file;
 }
 
-static psao_config config_of(bytes stream) {
+static inline psao_config config_of(bytes stream) {
     psao_config config;
     memset(&config, 0, sizeof config);
     config.struct_size = sizeof config;
@@ -60,7 +60,7 @@ typedef struct owned {
 } owned;
 
 /* The block ends where the client's memory ends, so that valgrind sees any byte beyond. */
-static owned make(const psao_config *config) {
+static inline owned make(const psao_config *config) {
     owned made;
     size_t size, align;
     GIVES(PSAO_OK, psao_client_memory_size(config, &size, &align));
