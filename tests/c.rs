@@ -265,3 +265,20 @@ fn the_shared_library_exports_the_listed_functions_and_nothing_else() {
     let listed = include_str!("../sdk/ffi/exports.txt");
     assert_eq!(symbols, listed.lines().collect::<Vec<_>>());
 }
+
+#[test]
+fn the_guide_has_a_remedy_for_every_result() {
+    let guide = include_str!("../docs/integrate.md");
+    let header = include_str!("../include/psao.h");
+    let results = header.lines().filter_map(|line| {
+        let (name, _) = line.trim().split_once(" = ")?;
+        let result = name.starts_with("PSAO_ERROR_") || name == "PSAO_RESYNC";
+        result.then_some(name)
+    });
+    let mut count = 0;
+    for name in results {
+        assert!(guide.contains(&format!("`{name}`")), "{name}");
+        count += 1;
+    }
+    assert!(count > 20, "{count} results");
+}

@@ -119,6 +119,10 @@ static void check_config(bytes stream) {
     free(block);
 }
 
+static psao_result push_from(psao_client *client, bytes stream, size_t at, size_t *used) {
+    return psao_client_push(client, stream.data + at, stream.size - at, 200, used);
+}
+
 static void check_order(bytes stream) {
     psao_config config = config_of(stream);
     config.log = take_message;
@@ -202,9 +206,9 @@ static void check_order(bytes stream) {
 
     /* A frame that nobody took is taken late, and whatever came since comes with it. */
     size_t at_byte = used;
-    GIVES(PSAO_OK, psao_client_push(client, stream.data + at_byte, stream.size - at_byte, 0, &used));
+    GIVES(PSAO_OK, push_from(client, stream, at_byte, &used));
     at_byte += used;
-    GIVES(PSAO_OK, psao_client_push(client, stream.data + at_byte, stream.size - at_byte, 0, &used));
+    GIVES(PSAO_OK, push_from(client, stream, at_byte, &used));
     at_byte += used;
     GIVES(PSAO_OK, psao_client_take(client, &frame));
     GIVES(PSAO_OK, psao_client_release(client));
@@ -236,10 +240,10 @@ static void check_order(bytes stream) {
     /* The new stream's first frame is a snapshot, and its end is known. */
     at_byte = 0;
     while (at_byte < stream.size) {
-        CHECK(psao_client_push(client, stream.data + at_byte, stream.size - at_byte, 7, &used) >= 0);
+        CHECK(push_from(client, stream, at_byte, &used) >= 0);
         at_byte += used;
     }
-    GIVES(PSAO_OK, psao_client_status(client, 7, &status));
+    GIVES(PSAO_OK, psao_client_status(client, 200, &status));
     CHECK(status.state == PSAO_STATE_ENDED);
     GIVES(PSAO_OK, psao_client_take(client, &frame));
     GIVES(PSAO_OK, psao_client_release(client));
@@ -344,7 +348,8 @@ static void check_damage(bytes stream) {
                 exact[cut * 7919 % cut] ^= (uint8_t)(1 << cut % 8);
             GIVES(PSAO_OK, psao_client_restart(made.client));
             size_t done = 0, used = 0;
-            while (done < cut && psao_client_push(made.client, exact + done, cut - done, 0, &used) >= 0)
+            while (done < cut &&
+                   psao_client_push(made.client, exact + done, cut - done, 0, &used) >= 0)
                 done += used;
         }
         free(exact);

@@ -20,10 +20,11 @@ const FIRST_BODY_BYTES: u32 = 4096;
 /// Follows one stream, in memory of yours. Opaque.
 ///
 /// Two sides use it: the pusher (psao_client_push, psao_client_restart, psao_client_header,
-/// psao_client_topology_hash, psao_client_stats, psao_client_error_text) and the taker (psao_client_take,
-/// psao_client_dirty_ranges, psao_client_lookup, psao_client_release). Each side must be one
-/// thread at a time. With psao_config.two_threads both sides may run at once, and neither ever
-/// waits for the other; without, they must not. psao_client_status is anyone's, at any time.
+/// psao_client_topology_hash, psao_client_stats, psao_client_error_text) and the taker
+/// (psao_client_take, psao_client_dirty_ranges, psao_client_lookup, psao_client_release). Each side
+/// must be one thread at a time. With psao_config.two_threads both sides may run at once, and
+/// neither ever waits for the other; without, they must not. psao_client_status is anyone's, at any
+/// time.
 pub struct psao_client {
     /// A panic was stopped at the border: nothing in here can be relied on.
     poisoned: AtomicBool,

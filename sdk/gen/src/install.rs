@@ -70,7 +70,7 @@ pub fn install(root: &Path, prefix: &Path) -> Result<(), String> {
         "lib/cmake/psao/psaoConfig.cmake",
         format!(
             "# psao::psao is the shared library, psao::static the other.\n\
-             get_filename_component(psao_prefix \"${{CMAKE_CURRENT_LIST_DIR}}/../../..\" ABSOLUTE)\n\
+             set(psao_prefix \"${{CMAKE_CURRENT_LIST_DIR}}/../../..\")\n\
              if(NOT TARGET psao::psao)\n\
              \x20 add_library(psao::psao SHARED IMPORTED)\n\
              \x20 set_target_properties(psao::psao PROPERTIES\n\
