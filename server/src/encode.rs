@@ -317,6 +317,15 @@ impl Encoder {
         }
     }
 
+    /// Profile `residual`: cells that the client has, and that it would have if nothing were left
+    /// out for being open.
+    pub fn cells(&self, world: &World) -> Option<[usize; 2]> {
+        match &self.sent {
+            Sent::Cells(_) => None,
+            Sent::Residual(sent) => Some(sent.cells(world)),
+        }
+    }
+
     /// The number of the last frame.
     pub fn frame_id(&self) -> u32 {
         self.frame_id

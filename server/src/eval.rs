@@ -23,7 +23,7 @@ use psao::{Client, Config};
 use psao_core::Cell;
 use psao_core::mirror::Buffer;
 use psao_core::residual::Quantiser;
-use psao_core::stream::{MAX_BODY_BYTES, PREAMBLE, Packet, StreamError, kind};
+use psao_core::stream::{MAX_BODY_BYTES, PREAMBLE, Packet, kind};
 use rayon::{ThreadPool, ThreadPoolBuilder};
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -135,9 +135,11 @@ pub struct Row {
     pub quant: String,
     /// Megabits per second of scene time.
     pub mbit_per_s: f64,
-    /// The part of it that is occlusion alone, in slices packets (profile `residual`); the rest is
-    /// cells that come into view, and what packets cost in themselves.
+    /// The part of it that is occlusion alone, in slices packets (profile `residual`).
     pub mbit_per_s_slices: f64,
+    /// The part of it that is where points are (profile `residual`): what a client with the scene's
+    /// topology at hand is not sent.
+    pub mbit_per_s_topology: f64,
     /// All of it, over the frames before the steady ones, with the stream's header.
     pub mbit_per_s_first_second: f64,
     /// Root mean square difference of the client's visible points from the server's, 1/255.
@@ -159,7 +161,7 @@ pub struct Row {
     pub rays_per_frame: f64,
     /// Points of the client's buffers that a frame changed.
     pub points_changed_per_frame: f64,
-    /// Share of the cells that are skipped for being open: 0 until any is.
+    /// Share of the cells of what is in view that the client has not got for being open.
     pub cells_skipped_share: f64,
     /// Memory of the client: buffers and all.
     pub client_bytes: u64,
@@ -179,6 +181,8 @@ pub struct Comparison {
     /// Bits of `cells` over bits of `residual`, interpolated to that error; `null` where there is
     /// nothing to interpolate between (one quantiser, or no bits).
     pub bits_cells_over_residual: Option<f64>,
+    /// The same for a client that has the topology already.
+    pub bits_cells_over_residual_shipped: Option<f64>,
     /// That error is outside of what the quantisers span.
     pub extrapolated: bool,
     /// The quantiser nearest to that error, which the times are of.
@@ -376,6 +380,7 @@ impl Bench<'_> {
         }
         let steady = left_out(args.frames, rate_hz) as usize;
         for stream in streams {
+            let cells = stream.encoder.cells(world);
             found.kbits.push(stream.kbits());
             found.rows.push(Row {
                 scene: world.scene.name.clone(),
@@ -383,6 +388,8 @@ impl Bench<'_> {
                 rate_hz,
                 step_ms: percentile(&step_ms[steady..], 0.5),
                 rays_per_frame: mean(&rays[steady..]),
+                cells_skipped_share: cells
+                    .map_or(0.0, |[has, all]| 1.0 - has as f64 / all.max(1) as f64),
                 ..stream.row(steady, rate_hz)
             });
         }
@@ -433,6 +440,7 @@ struct Stream {
 struct StreamFrame {
     bytes: usize,
     slices_bytes: usize,
+    topology_bytes: usize,
     encode_ms: f64,
     decode_ms: f64,
     rmse_255: f64,
@@ -508,7 +516,8 @@ impl Stream {
         }
         self.frames.push(StreamFrame {
             bytes: self.bytes.len(),
-            slices_bytes: slices_bytes(&self.bytes).map_err(|error| error.to_string())?,
+            slices_bytes: packets_bytes(&self.bytes, kind::SLICES)?,
+            topology_bytes: packets_bytes(&self.bytes, kind::PATCHES)?,
             encode_ms,
             decode_ms,
             rmse_255: point_rmse(world, mine, self.encoder.slices(), sight.sees),
@@ -559,6 +568,7 @@ impl Stream {
             quant: name_of(self.scheme),
             mbit_per_s: mean(&kbits[steady..]) * rate_hz / 1e3,
             mbit_per_s_slices: mean(&of(&|frame| frame.slices_bytes as f64)) * 8e-6 * rate_hz,
+            mbit_per_s_topology: mean(&of(&|frame| frame.topology_bytes as f64)) * 8e-6 * rate_hz,
             mbit_per_s_first_second: mean(&kbits[..steady]) * rate_hz / 1e3,
             rmse_255: mean(&of(&|frame| frame.rmse_255 * frame.rmse_255)).sqrt(),
             psnr_db: seen.then(|| -10.0 * error.log10()),
@@ -574,16 +584,13 @@ impl Stream {
     }
 }
 
-/// Bytes in slices packets.
-fn slices_bytes(stream: &[u8]) -> Result<usize, StreamError> {
+/// Bytes in packets of a kind.
+fn packets_bytes(stream: &[u8], kind: u8) -> Result<usize, String> {
     let mut rest = stream.strip_prefix(&PREAMBLE).unwrap_or(stream);
     let mut bytes = 0;
-    while let Some((packet, length)) = Packet::read(rest, MAX_BODY_BYTES)? {
-        bytes += if packet.kind == kind::SLICES {
-            length
-        } else {
-            0
-        };
+    let read = |rest| Packet::read(rest, MAX_BODY_BYTES).map_err(|error| error.to_string());
+    while let Some((packet, length)) = read(rest)? {
+        bytes += if packet.kind == kind { length } else { 0 };
         rest = &rest[length..];
     }
     Ok(bytes)
@@ -660,16 +667,18 @@ impl Evaluation {
             .iter()
             .min_by(|a, b| off(a, cells.rmse_255).total_cmp(&off(b, cells.rmse_255)));
         let Some(nearest) = nearest else { return };
-        let measured: Vec<(f64, f64)> = residual
-            .iter()
-            .map(|row| (row.rmse_255, row.mbit_per_s))
-            .collect();
-        let bits = bits_at(cells.rmse_255, &measured);
+        let at_equal_error = |bits: &dyn Fn(&Row) -> f64| {
+            let measured = residual.iter().map(|row| (row.rmse_255, bits(row)));
+            bits_at(cells.rmse_255, &measured.collect::<Vec<_>>())
+        };
+        let bits = at_equal_error(&|row| row.mbit_per_s);
+        let shipped = at_equal_error(&|row| row.mbit_per_s - row.mbit_per_s_topology);
         let comparison = Comparison {
             density,
             rate_hz,
             rmse_255: cells.rmse_255,
             bits_cells_over_residual: bits.map(|(bits, _)| cells.mbit_per_s / bits),
+            bits_cells_over_residual_shipped: shipped.map(|(bits, _)| cells.mbit_per_s / bits),
             extrapolated: bits.is_some_and(|(_, extrapolated)| extrapolated),
             nearest_quant: nearest.quant.clone(),
             nearest_rmse_255: nearest.rmse_255,
@@ -688,6 +697,7 @@ impl Evaluation {
             "Hz",
             "Mbit/s",
             "slices",
+            "topology",
             "first s",
             "rmse/255",
             "dB",
@@ -698,6 +708,7 @@ impl Evaluation {
             "step ms",
             "krays",
             "points",
+            "skipped",
             "client MB",
         ];
         let mut lines = vec![heads.map(String::from)];
@@ -712,6 +723,7 @@ impl Evaluation {
                 row.rate_hz.to_string(),
                 format!("{:.2}", row.mbit_per_s),
                 format!("{:.2}", row.mbit_per_s_slices),
+                format!("{:.2}", row.mbit_per_s_topology),
                 format!("{:.2}", row.mbit_per_s_first_second),
                 format!("{:.3}", row.rmse_255),
                 optional(row.psnr_db, 2),
@@ -722,6 +734,7 @@ impl Evaluation {
                 format!("{:.1}", row.step_ms),
                 format!("{:.1}", row.rays_per_frame / 1e3),
                 format!("{:.0}", row.points_changed_per_frame),
+                format!("{:.0} %", row.cells_skipped_share * 100.0),
                 format!("{:.1}", row.client_bytes as f64 / 1e6),
             ]);
         }
@@ -758,10 +771,14 @@ impl Evaluation {
             lines.push((
                 format!("{}/m², {} Hz", found.density, found.rate_hz),
                 format!(
-                    "bits of cells over residual at {:.3}/255 rms {bits}; at {} ({:.3}/255): \
+                    "bits of cells over residual at {:.3}/255 rms {bits}, with the topology \
+                     shipped {}; at {} ({:.3}/255): \
                      decode time of residual over cells {:.2}, encode time of cells over residual \
                      {:.1}",
                     found.rmse_255,
+                    found
+                        .bits_cells_over_residual_shipped
+                        .map_or("unknown".into(), |ratio| format!("{ratio:.1}")),
                     found.nearest_quant,
                     found.nearest_rmse_255,
                     found.decode_residual_over_cells,
@@ -783,10 +800,6 @@ impl Evaluation {
                 "the last {}; those before are \"first s\"",
                 steady.collect::<Vec<_>>().join(", ")
             ),
-        ));
-        lines.push((
-            "cells skipped".into(),
-            "none: open cells are still sent".into(),
         ));
         lines
     }

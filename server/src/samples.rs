@@ -7,7 +7,9 @@
 
 use std::f32::consts::TAU;
 
-use glam::{Vec3, Vec3A};
+use glam::{Mat3A, Vec3};
+
+use crate::rays::{Directions, Fan};
 
 /// Most rays a set holds; enough for references.
 pub const MAX_RAYS: usize = 4096;
@@ -18,8 +20,8 @@ const SETS: usize = 64;
 /// Sets of directions, computed once.
 pub struct Samples {
     rays: usize,
-    /// `SETS` sets of `rays` unit vectors each, around z.
-    directions: Vec<Vec3>,
+    /// Around z.
+    sets: Vec<Directions>,
 }
 
 /// A number that looks random, for 32 bits that don't.
@@ -76,14 +78,17 @@ impl Samples {
             (1..=MAX_RAYS).contains(&rays),
             "rays a point: {rays} is not within 1..={MAX_RAYS}"
         );
-        let direction = |i: usize| {
-            let [a, b] = sobol((i % rays) as u32, (i / rays) as u32).map(unit);
-            let (sin, cos) = (b * TAU).sin_cos();
-            Vec3::new(cos * a.sqrt(), sin * a.sqrt(), (1.0 - a).sqrt())
+        let set = |set: usize| {
+            let direction = |i: usize| {
+                let [a, b] = sobol(i as u32, set as u32).map(unit);
+                let (sin, cos) = (b * TAU).sin_cos();
+                Vec3::new(cos * a.sqrt(), sin * a.sqrt(), (1.0 - a).sqrt())
+            };
+            Directions::new(&(0..rays).map(direction).collect::<Vec<Vec3>>())
         };
         Samples {
             rays,
-            directions: (0..SETS * rays).map(direction).collect(),
+            sets: (0..SETS).map(set).collect(),
         }
     }
 
@@ -101,14 +106,16 @@ impl Samples {
             out.len(),
             self.rays
         );
-        let set = self.of_point(point_id, normal, tangent);
-        for (index, out) in out.iter_mut().enumerate() {
-            *out = set.direction(index);
+        let fan = self.fan(point_id, Vec3::ZERO, normal, tangent);
+        for index in 0..self.rays {
+            if let Some(out) = out.get_mut(fan.directions.given(index)) {
+                *out = fan.direction(index);
+            }
         }
     }
 
-    /// The set of a point, as in [`Samples::directions`], to take single directions from.
-    pub fn of_point(&self, point_id: u32, normal: Vec3, tangent: Vec3) -> PointSamples<'_> {
+    /// The rays of a point from `origin`, in the directions of [`Samples::directions`].
+    pub fn fan(&self, point_id: u32, origin: Vec3, normal: Vec3, tangent: Vec3) -> Fan<'_> {
         let bits = hash(point_id);
         let normal = scaled(normal)
             .and_then(Vec3::try_normalize)
@@ -125,37 +132,11 @@ impl Samples {
         let y = normal.cross(x);
         let (sin, cos) = (unit(bits) * TAU).sin_cos();
         // The low bits choose the set; the rotation comes from the high ones.
-        let first = bits as usize % SETS * self.rays;
-        PointSamples {
-            axes: [x * cos + y * sin, y * cos - x * sin, normal].map(Vec3A::from),
-            local: &self.directions[first..first + self.rays],
-        }
-    }
-}
-
-/// The directions of one point.
-pub struct PointSamples<'a> {
-    axes: [Vec3A; 3],
-    /// Around z.
-    local: &'a [Vec3],
-}
-
-impl PointSamples<'_> {
-    /// Direction `index` in the world.
-    pub fn direction(&self, index: usize) -> Vec3 {
-        let d = self.local[index];
-        let [x, y, z] = self.axes;
-        (x * d.x + y * d.y + z * d.z).into()
-    }
-
-    /// Sets the bits of those of the first `count` directions that are within a cone: whose dot
-    /// product with the unit `axis` is at least `cos`.
-    pub fn within_cone(&self, axis: Vec3, cos: f32, count: usize, bits: &mut [u64]) {
-        let local = Vec3::from(self.axes.map(|own| own.dot(Vec3A::from(axis))));
-        for (word, directions) in bits.iter_mut().zip(self.local[..count].chunks(64)) {
-            for (bit, direction) in directions.iter().enumerate() {
-                *word |= u64::from(direction.dot(local) >= cos) << bit;
-            }
+        let axes = [x * cos + y * sin, y * cos - x * sin, normal];
+        Fan {
+            origin,
+            axes: Mat3A::from_cols_array_2d(&axes.map(Vec3::into)),
+            directions: &self.sets[bits as usize % SETS],
         }
     }
 }

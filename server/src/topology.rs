@@ -302,6 +302,14 @@ impl Topology {
         self.bytes
     }
 
+    /// A patch's points of a level.
+    pub fn points_of(&self, patch: u32, level: u32) -> impl Iterator<Item = &PatchPoint> {
+        let set = self.first_patch.partition_point(|first| *first <= patch) - 1;
+        let range = self.sets[set].patch_range((patch - self.first_patch[set]) as usize);
+        let points = self.sets[set].coded[range].iter();
+        points.filter(move |point| u32::from(point.level) >= level)
+    }
+
     /// A patch's bytes.
     pub fn patch(&self, index: u32) -> &[u8] {
         let set = self.first_patch.partition_point(|first| *first <= index) - 1;

@@ -6,8 +6,10 @@
 //! others again only when something moved within their reach.
 
 use crate::points::{PointError, SurfacePoint, generate, largest_radius, morton_order};
-use crate::rays::{Against, CpuTracer, Deformed, TooManyTriangles, Tracer, offset_origin, reach};
-use crate::samples::{PointSamples, Samples};
+use crate::rays::{
+    Against, CpuTracer, Deformed, Fan, TooManyTriangles, Tracer, offset_origin, reach,
+};
+use crate::samples::Samples;
 use crate::scene::{InstancePose, Mesh, Pose, Scene};
 use crate::topology::{Adjacency, PointSet, SLICE_BLOCKS, Topology};
 use crate::truth::{Place, Placement, Truth, buckets_for, choose_buckets, fit};
@@ -203,8 +205,10 @@ pub struct World {
     /// Rays against what each point is attached to: bits of those that hit.
     fixed: Vec<u64>,
     moves: Vec<bool>,
-    /// World bounds of each instance that moves, now and at the step before.
-    swept: Vec<[[Vec3; 2]; 2]>,
+    /// Where each instance that moves is, now and at the step before.
+    swept: Vec<[Hull; 2]>,
+    /// Space for what the traced points say, kept from step to step.
+    traced: Vec<u8>,
     driven: BTreeMap<u32, DAffine3>,
     posed: BTreeMap<u32, Vec<Affine3A>>,
     previous: Pose,
@@ -258,7 +262,8 @@ impl World {
             openness: Vec::new(),
             topology: Topology::default(),
             fixed: Vec::new(),
-            swept: vec![[[Vec3::ZERO; 2]; 2]; scene.instances.len()],
+            swept: vec![[Hull::default(); 2]; scene.instances.len()],
+            traced: Vec::new(),
             driven: BTreeMap::new(),
             posed: BTreeMap::new(),
             previous: pose.clone(),
@@ -502,14 +507,14 @@ impl World {
     fn promote(&mut self, instance: u32) {
         self.moves[instance as usize] = true;
         self.sweep();
-        let bounds = self.swept[instance as usize][0];
+        let hull = self.swept[instance as usize][0];
         // It has no more triangles than before, so the tracer that fitted still fits.
         if let Ok(tracer) = CpuTracer::new(&self.scene, &self.pose, &self.deformed, &self.moves) {
             self.tracer = tracer;
         }
         let (reach, words) = (self.options.ao_distance_m, self.words());
         for slice in &mut self.slices {
-            if slice.instance == instance || touches(slice.bounds, bounds, reach) {
+            if slice.instance == instance || hull.is_near(slice.bounds, reach) {
                 slice.rays_done = 0;
                 slice.stale = true;
                 let points = slice.points.start as usize..slice.points.end as usize;
@@ -577,10 +582,14 @@ impl World {
     /// Takes the movers' bounds of the present pose.
     fn sweep(&mut self) {
         for instance in (0..self.moves.len()).filter(|&i| self.moves[i]) {
-            let local = bounds_of(self.vertices(instance as u32).0.iter().copied());
+            let deforms = self.scene.instances[instance].deforms;
+            let [now, _] = self.swept[instance];
+            let local = match now.local {
+                Some(local) if !deforms => local,
+                _ => LocalHull::of(self.vertices(instance as u32).0),
+            };
             let world = &self.pose.instances[instance].world_from_local;
-            let [before, now] = [self.swept[instance][0], placed_bounds(world, local)];
-            self.swept[instance] = [now, before];
+            self.swept[instance] = [Hull::new(local, world), now];
         }
     }
 
@@ -597,9 +606,7 @@ impl World {
             if !(self.moves[instance] && (turned || bent)) {
                 continue;
             }
-            let number = instance as u32;
-            let [after, before] = self.swept[instance];
-            swept.push((number, [before[0].min(after[0]), before[1].max(after[1])]));
+            swept.push((instance as u32, self.swept[instance]));
             if let Some(carrier) = &mut self.carriers[instance] {
                 carrier.unplaced |= carrier.loose;
                 for slice in carrier.slices.clone() {
@@ -610,8 +617,9 @@ impl World {
         }
         let reach = self.options.ao_distance_m;
         for slice in &mut self.slices {
-            slice.stale |= swept.iter().any(|(instance, bounds)| {
-                *instance != slice.instance && touches(slice.bounds, *bounds, reach)
+            slice.stale |= swept.iter().any(|(instance, hulls)| {
+                let near = |hull: &Hull| hull.is_near(slice.bounds, reach);
+                *instance != slice.instance && hulls.iter().any(near)
             });
         }
     }
@@ -736,32 +744,61 @@ impl World {
                 due.push((index, rays));
             }
         }
-        let done = std::sync::atomic::AtomicU64::new(0);
         let total: u64 = due
             .iter()
             .map(|&(slice, _)| self.slices[slice].points.len() as u64)
             .sum();
-        let traced: Vec<Traced> = due
-            .par_iter()
-            .map(|&(slice, rays)| {
-                let traced = self.trace_slice(slice, rays);
-                let points = self.slices[slice].points.len() as u64;
+        let words = self.words();
+        // Out of the world, so that threads can fill their parts of them.
+        let (mut fixed, mut traced) = (
+            std::mem::take(&mut self.fixed),
+            std::mem::take(&mut self.traced),
+        );
+        traced.resize(total as usize, 0);
+        let mut batches = Vec::new();
+        let (mut bits, mut bits_from, mut occlusion) = (&mut fixed[..], 0, &mut traced[..]);
+        for &(slice, rays) in &due {
+            for first in self.slices[slice].points.clone().step_by(BATCH_POINTS) {
+                let last = self.slices[slice]
+                    .points
+                    .end
+                    .min(first + BATCH_POINTS as u32);
+                let from = first as usize * words;
+                let skipped = bits.split_at_mut(from - bits_from).1;
+                let (own, rest) = skipped.split_at_mut((last - first) as usize * words);
+                (bits, bits_from) = (rest, last as usize * words);
+                let (own_occlusion, rest) = occlusion.split_at_mut((last - first) as usize);
+                occlusion = rest;
+                batches.push(Batch {
+                    slice,
+                    points: first..last,
+                    rays,
+                    fixed: own,
+                    occlusion: own_occlusion,
+                });
+            }
+        }
+        let done = std::sync::atomic::AtomicU64::new(0);
+        let (rays, points) = batches
+            .par_iter_mut()
+            .with_max_len(2)
+            .map(|batch| {
+                let counts = self.trace_batch(batch);
+                let points = batch.points.len() as u64;
                 let so_far = done.fetch_add(points, std::sync::atomic::Ordering::Relaxed);
                 report(so_far + points, total);
-                traced
+                counts
             })
-            .collect();
-        for (&(index, rays), traced) in due.iter().zip(&traced) {
+            .reduce(|| (0, 0), |a, b| (a.0 + b.0, a.1 + b.1));
+        (stats.rays, stats.points) = (rays, points);
+        let mut occlusion = traced.iter();
+        for &(index, rays) in &due {
             let slice = &mut self.slices[index];
             slice.rays_done = rays;
             slice.stale = false;
-            let (first, words) = (slice.points.start as usize, all.div_ceil(64));
-            stats.rays += traced.rays;
-            stats.points += traced.points;
-            let bits = first * words..first * words + traced.fixed.len();
-            self.fixed[bits].copy_from_slice(&traced.fixed);
             let mut changed = false;
-            for (point, &occlusion) in (first..).zip(&traced.occlusion) {
+            for (point, &occlusion) in slice.points.clone().zip(&mut occlusion) {
+                let point = point as usize;
                 if self.occlusion[point] != occlusion {
                     self.occlusion[point] = occlusion;
                     if let Some(place) = self.places.get(point) {
@@ -774,11 +811,13 @@ impl World {
                 self.note_change(index);
             }
         }
+        (self.fixed, self.traced) = (fixed, traced);
         stats
     }
 
-    fn trace_slice(&self, index: usize, rays: usize) -> Traced {
-        let slice = &self.slices[index];
+    /// Traces some points of a slice; rays and points that were traced.
+    fn trace_batch(&self, batch: &mut Batch<'_>) -> (u64, u64) {
+        let slice = &self.slices[batch.slice];
         let instance = slice.instance;
         let deforms = self.scene.instances[instance as usize].deforms;
         let (attached, others) = match (deforms, self.moves[instance as usize]) {
@@ -794,73 +833,71 @@ impl World {
         let pose = &self.pose.instances[instance as usize];
         let reach = self.reach(instance);
         let t_max = self.options.ao_distance_m;
-        let movers = self.movers_near(slice.bounds);
-        let words = self.words();
-        let mut traced = Traced::default();
-        let mut directions = vec![Vec3::ZERO; rays];
-        let mut todo = vec![0u64; words];
-        let mut hit = vec![0u64; words];
-        let attached_hits = |number: u32| {
-            let first = number as usize * words;
-            &self.fixed[first..first + words]
-        };
-        for number in slice.points.clone() {
+        let (rays, words) = (batch.rays, self.words());
+        let converging = rays > slice.rays_done;
+        let near = |hull: &Hull| hull.is_near(slice.bounds, t_max);
+        let movers = (0..self.moves.len()).filter(|&mover| self.moves[mover]);
+        let movers: Vec<Hull> = movers
+            .map(|mover| self.swept[mover][0])
+            .filter(near)
+            .collect();
+        let (mut todo, mut hit, mut known) = (vec![0; words], vec![0; words], vec![0; words]);
+        let (mut rays_traced, mut points_traced) = (0, 0);
+        let parts = batch
+            .fixed
+            .chunks_exact_mut(words)
+            .zip(&mut *batch.occlusion);
+        for (number, (fixed, occlusion)) in batch.points.clone().zip(parts) {
             let point = &self.points[number as usize];
             let local = point.position(triangles, positions);
             let position = pose.world_from_local.transform_point3(local);
-            let normal = pose.world_normal(point.normal(triangles, positions, normals));
-            let outward = pose.world_normal(point.geometric_normal(triangles, positions));
-            let origin = offset_origin(position, outward, reach);
-            let converging = rays > slice.rays_done;
-            let reached = |mover: &&[Vec3; 2]| can_reach(**mover, origin, normal, t_max);
-            let others_near = others != Against::Movers || movers.iter().any(|m| reached(&m));
-            if !converging && !others_near {
-                traced.push(attached_hits(number), rays);
+            let only_movers = others == Against::Movers;
+            let in_reach = |mover: &&Hull| mover.is_within(position, t_max);
+            if only_movers && !converging && !movers.iter().any(|m| in_reach(&m)) {
+                *occlusion = openness(fixed, rays);
                 continue;
             }
+            let normal = pose.world_normal(point.normal(triangles, positions, normals));
+            let ahead = |mover: &&Hull| in_reach(mover) && mover.is_ahead(position, normal);
+            let others_near = !only_movers || movers.iter().any(|m| ahead(&m));
+            if !converging && !others_near {
+                *occlusion = openness(fixed, rays);
+                continue;
+            }
+            let outward = pose.world_normal(point.geometric_normal(triangles, positions));
+            let origin = offset_origin(position, outward, reach);
             let tangent = point.tangent(triangles, positions);
             let tangent = pose.world_from_local.transform_vector3(tangent);
-            let samples = self.samples.of_point(number, normal, tangent);
-            traced.points += 1;
+            let fan = self.samples.fan(number, origin, normal, tangent);
+            points_traced += 1;
             hit.fill(0);
             if let Some(attached) = attached {
-                hit.copy_from_slice(attached_hits(number));
                 if converging {
-                    set_bits(&mut todo, slice.rays_done..rays);
-                    traced.rays += take(&samples, &todo, &hit, &mut directions);
+                    fan.directions.mark_given(slice.rays_done..rays, &mut todo);
+                    rays_traced += open(&todo, fixed);
                     self.tracer
-                        .occluded(attached, origin, &directions, t_max, &todo, &mut hit);
-                    traced.fixed.extend_from_slice(&hit);
+                        .occluded_fan(attached, &fan, t_max, &todo, fixed);
                 }
+                hit.copy_from_slice(fixed);
             }
             if others_near {
+                fan.directions.mark_given(0..rays, &mut todo);
                 // A ray that hit what the point is attached to needs no other; nor, where only
                 // movers are left, does one that leaves beside all of them.
-                if others == Against::Movers {
-                    todo.fill(0);
-                    for mover in movers.iter().filter(reached) {
-                        mark_towards(*mover, origin, &samples, rays, &mut todo);
+                if only_movers {
+                    known.fill(0);
+                    for mover in movers.iter().filter(ahead) {
+                        mark_towards(mover, &fan, &mut known);
                     }
-                } else {
-                    set_bits(&mut todo, 0..rays);
+                    todo.iter_mut().zip(&known).for_each(|(t, k)| *t &= k);
                 }
-                traced.rays += take(&samples, &todo, &hit, &mut directions);
+                rays_traced += open(&todo, &hit);
                 self.tracer
-                    .occluded(others, origin, &directions, t_max, &todo, &mut hit);
+                    .occluded_fan(others, &fan, t_max, &todo, &mut hit);
             }
-            traced.push(&hit, rays);
+            *occlusion = openness(&hit, rays);
         }
-        traced
-    }
-
-    /// Bounds of the movers that can be within reach of a slice's points.
-    fn movers_near(&self, bounds: [Vec3; 2]) -> Vec<[Vec3; 2]> {
-        let near = |now: &[Vec3; 2]| touches(bounds, *now, self.options.ao_distance_m);
-        let movers = (0..self.moves.len()).filter(|&instance| self.moves[instance]);
-        movers
-            .map(|instance| self.swept[instance][0])
-            .filter(near)
-            .collect()
+        (rays_traced, points_traced)
     }
 
     fn mesh(&self, instance: u32) -> &Mesh {
@@ -1113,69 +1150,120 @@ impl std::fmt::Display for NoInstance {
 
 impl std::error::Error for NoInstance {}
 
-#[derive(Default)]
-struct Traced {
-    occlusion: Vec<u8>,
-    /// Empty unless the slice gained rays.
-    fixed: Vec<u64>,
-    rays: u64,
-    points: u64,
+/// Points of a slice that are traced together: few, so that all threads end together.
+const BATCH_POINTS: usize = 128;
+
+/// Some points of a slice, to be traced.
+struct Batch<'a> {
+    slice: usize,
+    points: Range<u32>,
+    /// As many of the rays are to be known.
+    rays: usize,
+    /// Their part of [`World::fixed`].
+    fixed: &'a mut [u64],
+    /// What they say.
+    occlusion: &'a mut [u8],
 }
 
-/// Whether a ray from `origin` into the hemisphere around `normal` can meet a box within `t_max`.
-fn can_reach([min, max]: [Vec3; 2], origin: Vec3, normal: Vec3, t_max: f32) -> bool {
-    let near = origin.clamp(min, max).distance_squared(origin) <= t_max * t_max;
-    let (center, half) = ((min + max) * 0.5, (max - min) * 0.5);
-    near && normal.dot(center - origin) + normal.abs().dot(half) > 0.0
+/// Bounds of an instance's vertices in local space.
+#[derive(Clone, Copy, Debug)]
+struct LocalHull {
+    bounds: [Vec3; 2],
+    /// Farthest vertex from the middle of the bounds.
+    radius: f32,
 }
 
-impl Traced {
-    fn push(&mut self, hit: &[u64], rays: usize) {
-        let open = 255.0 * (1.0 - count(hit) as f32 / rays as f32);
-        self.occlusion.push((open + 0.5) as u8);
-    }
-}
-
-/// Makes the directions that are asked for and not known to hit, and counts them.
-fn take(samples: &PointSamples, todo: &[u64], hit: &[u64], directions: &mut [Vec3]) -> u64 {
-    let mut rays = 0;
-    for (word, (todo, hit)) in todo.iter().zip(hit).enumerate() {
-        let mut rest = todo & !hit;
-        rays += u64::from(rest.count_ones());
-        while rest != 0 {
-            let index = word * 64 + rest.trailing_zeros() as usize;
-            directions[index] = samples.direction(index);
-            rest &= rest - 1;
+impl LocalHull {
+    fn of(positions: &[Vec3]) -> LocalHull {
+        let bounds = bounds_of(positions.iter().copied());
+        let center = (bounds[0] + bounds[1]) * 0.5;
+        let squared = |p: &Vec3| p.distance_squared(center);
+        let farthest = positions.iter().map(squared).fold(0.0, f32::max);
+        LocalHull {
+            bounds,
+            radius: farthest.sqrt(),
         }
     }
-    rays
 }
 
-/// Marks the rays that can meet the ball around a box.
-fn mark_towards(
-    [min, max]: [Vec3; 2],
-    origin: Vec3,
-    samples: &PointSamples,
-    rays: usize,
-    todo: &mut [u64],
-) {
-    let to = (min + max) * 0.5 - origin;
-    let radius_squared = (max - min).length_squared() * 0.25;
-    let sin_squared = radius_squared / to.length_squared();
-    if sin_squared < 1.0 {
+/// Bounds of a mover in the world: a box, and a ball, whichever is tighter.
+#[derive(Clone, Copy, Debug, Default)]
+struct Hull {
+    bounds: [Vec3; 2],
+    center: Vec3,
+    radius: f32,
+    /// What it was made from.
+    local: Option<LocalHull>,
+}
+
+impl Hull {
+    fn new(local: LocalHull, world_from_local: &Affine3A) -> Hull {
+        let [min, max] = placed_bounds(world_from_local, local.bounds);
+        let center = (min + max) * 0.5;
+        // Gershgorin's bound of the largest stretch; exact without shear.
+        let m = world_from_local.matrix3;
+        let squared = m.transpose() * m;
+        let row = |row: Vec3A| row.abs().element_sum();
+        let stretch = row(squared.x_axis)
+            .max(row(squared.y_axis))
+            .max(row(squared.z_axis));
+        // A little more, for rounding.
+        let radius = local.radius * stretch.sqrt() * 1.0001 + center.abs().max_element() * 1e-6;
+        Hull {
+            bounds: [min.max(center - radius), max.min(center + radius)],
+            center,
+            radius,
+            local: Some(local),
+        }
+    }
+
+    /// A ray of length `reach` from within `bounds` may meet it.
+    fn is_near(&self, bounds: [Vec3; 2], reach: f32) -> bool {
+        let nearest = self.center.clamp(bounds[0], bounds[1]);
+        let far = reach + self.radius;
+        touches(bounds, self.bounds, reach) && nearest.distance_squared(self.center) <= far * far
+    }
+
+    /// A ray of length `reach` from a place may meet it.
+    fn is_within(&self, position: Vec3, reach: f32) -> bool {
+        let far = reach + self.radius;
+        let nearest = position.clamp(self.bounds[0], self.bounds[1]);
+        position.distance_squared(self.center) <= far * far
+            && nearest.distance_squared(position) <= reach * reach * 1.0001
+    }
+
+    /// Part of it is above the plane at a place.
+    fn is_ahead(&self, position: Vec3, normal: Vec3) -> bool {
+        let [min, max] = self.bounds;
+        let (center, half) = ((min + max) * 0.5, (max - min) * 0.5);
+        let of_box = normal.dot(center - position) + normal.abs().dot(half);
+        of_box > 0.0 && normal.dot(self.center - position) > -self.radius
+    }
+}
+
+/// What a point says of which `rays` of its rays some hit.
+fn openness(hit: &[u64], rays: usize) -> u8 {
+    let open = 255.0 * (1.0 - count(hit) as f32 / rays as f32);
+    (open + 0.5) as u8
+}
+
+/// How many rays are asked for and not known to hit.
+fn open(todo: &[u64], hit: &[u64]) -> u64 {
+    let open = todo.iter().zip(hit).map(|(todo, hit)| todo & !hit);
+    open.map(|open| u64::from(open.count_ones())).sum()
+}
+
+/// Marks the rays that can meet the ball around a mover.
+fn mark_towards(mover: &Hull, fan: &Fan<'_>, marked: &mut [u64]) {
+    let to = mover.center - fan.origin;
+    let sin_squared = mover.radius * mover.radius / to.length_squared();
+    let cos = if sin_squared < 1.0 {
         // A little wider, for rounding.
-        let cos = (1.0 - sin_squared).sqrt() - 1e-4;
-        samples.within_cone(to.normalize(), cos, rays, todo);
+        (1.0 - sin_squared).sqrt() - 1e-4
     } else {
-        set_bits(todo, 0..rays);
-    }
-}
-
-fn set_bits(words: &mut [u64], bits: Range<usize>) {
-    words.fill(0);
-    for bit in bits {
-        words[bit / 64] |= 1 << (bit % 64);
-    }
+        -2.0
+    };
+    fan.mark_cone(to.normalize_or_zero(), cos, marked);
 }
 
 fn count(words: &[u64]) -> u64 {

@@ -109,7 +109,7 @@ fn allocate<M: Memory>(
 ) -> Option<u32> {
     let cells = mirror.capacity().cells as usize;
     let entry = bucket.entries.iter_mut().find(|entry| **entry == 0)?;
-    let index = dirty::next_run(free, cells, 0)?.start;
+    let index = dirty::first(free, cells)?;
     *entry = index as u32;
     let cell = Cell {
         key,
@@ -156,5 +156,131 @@ pub fn remove<M: Memory>(
         let _ = mirror.set_bucket(home, bucket);
         let _ = mirror.set_cell(index, Cell::default());
         dirty::mark(free, mirror.capacity().cells as usize, index as usize);
+    }
+}
+
+#[cfg(test)]
+#[allow(
+    clippy::indexing_slicing,
+    clippy::unwrap_used,
+    clippy::arithmetic_side_effects
+)]
+mod tests {
+    extern crate std;
+    use super::*;
+    use crate::mirror::{Borrowed, Capacity, PartsMut};
+    use std::collections::HashMap;
+    use std::vec;
+    use std::vec::Vec;
+
+    #[test]
+    fn cells_hold_what_was_put_in_and_not_taken_out() {
+        let capacity = Capacity {
+            instances: 1,
+            buckets: 9,
+            cells: 40,
+            ..Capacity::default()
+        };
+        let (mut instances, mut buckets) = ([Instance::default()], [Bucket::default(); 9]);
+        let mut cells = [Cell::default(); 40];
+        let mut dirty = vec![0; capacity.dirty_words()];
+        let mut mirror = Mirror::new(Borrowed(PartsMut {
+            instances: &mut instances,
+            buckets: &mut buckets,
+            cells: &mut cells,
+            dirty: &mut dirty,
+        }));
+        let mut free = vec![0; dirty::words(40)];
+        free_all(&mut free, 40);
+        let grid = Instance {
+            radius: 1.0,
+            cells_per_unit: [1.0; 3],
+            normal_scale: [1.0; 3],
+            dims: [5, 4, 3],
+            bucket_count: 9,
+            ..Instance::default()
+        };
+        mirror.set_instance(0, grid).unwrap();
+        let mut seed = 1u32;
+        let mut random = |below: u32| {
+            seed = seed.wrapping_mul(747796405).wrapping_add(2891336453);
+            (seed >> 12) % below
+        };
+        let mut held: Vec<(Bin, Place, Point)> = Vec::new();
+        let (mut full_cells, mut no_room) = (0, 0);
+        for _ in 0..20_000 {
+            if random(held.len() as u32 / 4 + 40) < 60 {
+                let cell = [random(5), random(4), random(3)];
+                let position = [random(32), random(32), random(32)];
+                let bin = Bin { cell, position };
+                let point = Point::pack(position, random(225) as u8, random(256) as u8);
+                let place = insert(&mut mirror, &mut free, &grid, bin, point);
+                let here = held.iter().filter(|(other, ..)| other.cell == cell).count();
+                if place == NOWHERE {
+                    full_cells += usize::from(here == CELL_POINTS);
+                    no_room += usize::from(here == 0);
+                    assert!(here == CELL_POINTS || here == 0);
+                } else {
+                    held.push((bin, place, point));
+                }
+            } else {
+                let (bin, place, _) = held.swap_remove(random(held.len() as u32) as usize);
+                remove(&mut mirror, &mut free, &grid, bin, place);
+            }
+            let mut by_cell: HashMap<[u32; 3], Vec<u32>> = HashMap::new();
+            for (bin, place, point) in &held {
+                assert_eq!(mirror.point(*place), Some(*point));
+                by_cell.entry(bin.cell).or_default().push(point.0);
+            }
+            let lookup = mirror.lookup();
+            let mut found = 0;
+            for (cell, points) in &mut by_cell {
+                let cell = lookup.find(&grid, *cell).unwrap();
+                let mut has: Vec<u32> = cell.points().map(|point| point.0).collect();
+                has.sort_unstable();
+                points.sort_unstable();
+                assert_eq!(has, *points);
+                found += 1;
+            }
+            let used = mirror
+                .cells()
+                .iter()
+                .filter(|cell| **cell != Cell::default());
+            assert_eq!(used.count(), found, "a cell without points is all zero");
+        }
+        assert!(full_cells > 0 && no_room > 0);
+        assert_eq!(mirror.hash(), mirror.recompute_hash());
+    }
+
+    #[test]
+    fn a_level_up_has_cells_that_are_longer_by_the_root_of_two() {
+        let grid = |level| Instance {
+            dims: [1 << 20; 3],
+            level,
+            ..Instance::default()
+        };
+        let point = |position| PatchPoint {
+            position: [position; 3],
+            ..PatchPoint::default()
+        };
+        for position in [0, 1, 31, 32, 1000, (1 << 25) - 1] {
+            let bins = [0, 1, 2, 3].map(|level| Bin::of(&grid(level), &point(position)).unwrap());
+            assert_eq!(bins[0].cell[0], position >> 5);
+            assert_eq!(bins[0].position[0], position & 31);
+            for (level, bin) in (0..).zip(bins) {
+                let steps = f64::from(bin.cell[2] * 32 + bin.position[2]) + 0.5;
+                let factor = f64::from(SCALES[level as usize]) / 65536.0;
+                assert!((factor * 2f64.powf(0.5 * f64::from(level)) - 1.0).abs() < 3e-5);
+                let expected = (f64::from(position) + 0.5) * factor;
+                let off = (steps - expected).abs();
+                assert!(off <= 0.5, "{position} {level}: {off}");
+            }
+        }
+        let small = Instance {
+            dims: [2, 3, 4],
+            ..Instance::default()
+        };
+        assert_eq!(Bin::of(&small, &point(64)), None);
+        assert!(Bin::of(&small, &point(63)).is_some());
     }
 }

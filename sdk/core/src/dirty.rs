@@ -21,12 +21,21 @@ pub fn mark(set: &mut [u64], len: usize, index: usize) {
     }
 }
 
-/// Removes `index` (ignored if not below `len`). The summary bit may stay set: it only says
-/// "look here".
+/// Removes `index` (ignored if not below `len`).
 pub fn unmark(set: &mut [u64], len: usize, index: usize) {
     if index < len {
-        set[index / 64] &= !(1 << (index % 64));
+        let word = index / 64;
+        set[word] &= !(1 << (index % 64));
+        if set[word] == 0 {
+            set[len.div_ceil(64) + word / 64] &= !(1 << (word % 64));
+        }
     }
+}
+
+/// The lowest index in the set.
+pub fn first(set: &[u64], len: usize) -> Option<usize> {
+    let (bits, summary) = set.split_at(len.div_ceil(64));
+    (len > 0).then(|| next_set(bits, summary, 0)).flatten()
 }
 
 /// Adds every index below `len`.
@@ -91,11 +100,7 @@ fn next_set(bits: &[u64], summary: &[u64], from: usize) -> Option<usize> {
             continue;
         }
         word += block.trailing_zeros() as usize;
-        // An unmarked word may have left its summary bit behind.
-        if bits[word] != 0 {
-            return Some(word * 64 + bits[word].trailing_zeros() as usize);
-        }
-        word += 1;
+        return Some(word * 64 + bits[word].trailing_zeros() as usize);
     }
     None
 }
@@ -136,6 +141,7 @@ mod tests {
                 }
                 let plain: Vec<usize> = (0..len).filter(|&i| flags[i]).collect();
                 assert_eq!(expected, plain);
+                assert_eq!(first(&set, len), plain.first().copied());
             }
             clear(&mut set, len);
             assert_eq!(next_run(&set, len, 0), None);

@@ -54,6 +54,20 @@ impl Odds {
     }
 }
 
+/// Odds of so many yeses in 256 cases each.
+pub(crate) const fn odds<const N: usize>(starts: [u8; N]) -> [Odds; N] {
+    let mut odds = [Odds::new(128); N];
+    let mut at = 0;
+    while at < N {
+        #[allow(clippy::indexing_slicing, clippy::arithmetic_side_effects)]
+        {
+            odds[at] = Odds::new(starts[at]);
+            at += 1;
+        }
+    }
+    odds
+}
+
 /// The last bytes of a run: as few as name a number in the interval, read with zeros after them.
 /// Returns that number, wrapped at 2^64 (a carry), and how many bytes of it count.
 fn ending(low: u64, range: u64) -> (u64, usize) {

@@ -15,7 +15,7 @@
 )]
 
 use crate::point::NORMAL_STEPS;
-use crate::range::{Decoder, Encoder, Full, Odds};
+use crate::range::{Decoder, Encoder, Full, Odds, odds};
 use crate::stream::StreamError;
 use crate::topology::{PATCH_POINTS, PatchPoint};
 use bytemuck::{Pod, Zeroable};
@@ -31,11 +31,11 @@ const NEIGHBOURS: usize = 3;
 
 /// How far away in the slice's order a neighbour may be. Points are in Morton order, so those
 /// near in space are near in the order.
-const WINDOW: usize = 64;
+const WINDOW: usize = 24;
 
 /// The same for the item that opens a slice. Most slices never change again, so the search for
 /// better neighbours can wait for the first item after it.
-const WINDOW_FIRST: usize = 12;
+const WINDOW_FIRST: usize = 16;
 
 /// A point's nearest neighbours on the same surface, as distances in the slice's order; 0 where
 /// there is none. Made by [`find_neighbours`] from what both sides know.
@@ -54,62 +54,96 @@ pub struct Neighbours {
 /// What is longer than the other, or than [`SLICE_POINTS`], is left alone.
 pub fn find_neighbours(points: &[PatchPoint], first: bool, out: &mut [Neighbours]) {
     let window = if first { WINDOW_FIRST } else { WINDOW };
-    // The nearest so far, near ones first: distance in space and in the order.
-    const NONE: [(u32, u8); NEIGHBOURS] = [(u32::MAX, 0); NEIGHBOURS];
-    let mut later = [NONE; SLICE_POINTS];
     let count = points.len().min(out.len()).min(SLICE_POINTS);
-    for (at, point) in points.iter().take(count).enumerate() {
-        let mut earlier = NONE;
+    // Coordinates side by side, so that distances to a whole window are computed at once. What is
+    // farther apart than `FAR` counts as that.
+    let mut axes = [[0i32; SLICE_POINTS]; 3];
+    let corner = points.first().map_or([0; 3], |point| point.position);
+    for (axis, (places, corner)) in axes.iter_mut().zip(corner).enumerate() {
+        for (place, point) in places.iter_mut().zip(points) {
+            let position = point.position.get(axis).copied().unwrap_or_default();
+            *place = position.wrapping_sub(corner) as i32;
+        }
+    }
+    let [xs, ys, zs] = &axes;
+    let mut later = [NONE; SLICE_POINTS];
+    // How near one has to be to be among them.
+    let mut later_wanted = [if first { 0 } else { i32::MAX }; SLICE_POINTS];
+    let mut squares = [0i32; WINDOW];
+    for at in 0..count {
         let start = at.saturating_sub(window);
-        let (Some(others), Some(laters)) = (points.get(start..at), later.get_mut(start..at)) else {
+        let (Some(x), Some(y), Some(z), Some(point)) =
+            (xs.get(at), ys.get(at), zs.get(at), points.get(at))
+        else {
             break;
         };
-        let others = others.iter().zip(laters).rev();
-        for (back, (other, other_later)) in (1u8..).zip(others) {
-            let squared = squared(&point.position, &other.position);
-            let wanted = if first {
-                farthest(&earlier)
-            } else {
-                farthest(&earlier).max(farthest(other_later))
-            };
+        let (Some(xs), Some(ys), Some(zs)) =
+            (xs.get(start..at), ys.get(start..at), zs.get(start..at))
+        else {
+            break;
+        };
+        let along = |p: i32, q: i32| {
+            let steps = p.wrapping_sub(q).clamp(-FAR, FAR);
+            steps.wrapping_mul(steps)
+        };
+        for (((square, px), py), pz) in squares.iter_mut().zip(xs).zip(ys).zip(zs) {
+            *square = along(*px, *x)
+                .wrapping_add(along(*py, *y))
+                .wrapping_add(along(*pz, *z));
+        }
+        let mut earlier = NONE;
+        let mut earlier_wanted = i32::MAX;
+        let (Some(others), Some(laters), Some(laters_wanted)) = (
+            points.get(start..at),
+            later.get_mut(start..at),
+            later_wanted.get_mut(start..at),
+        ) else {
+            break;
+        };
+        let others = others.iter().zip(laters).zip(laters_wanted).zip(&squares);
+        for (back, (((other, other_later), other_wanted), square)) in (1u8..).zip(others.rev()) {
             // Facing another way only adds.
-            if squared >= wanted {
+            if *square >= earlier_wanted.max(*other_wanted) {
                 continue;
             }
+            let squared = *square as u32;
             let apart = squared.saturating_add(turned(squared, point.normal, other.normal));
-            keep(&mut earlier, (apart, back));
+            let candidate = u64::from(apart) << 8 | u64::from(back);
+            keep(&mut earlier, candidate);
+            earlier_wanted = farthest(&earlier);
             if !first {
-                keep(other_later, (apart, back));
+                keep(other_later, candidate);
+                *other_wanted = farthest(other_later);
             }
         }
         if let Some(out) = out.get_mut(at) {
-            out.earlier = earlier.map(|(_, back)| back);
+            out.earlier = earlier.map(|candidate| candidate as u8);
         }
     }
     for (out, later) in out.iter_mut().zip(&later).take(count) {
-        out.later = later.map(|(_, forward)| forward);
+        out.later = later.map(|candidate| candidate as u8);
     }
 }
 
-fn farthest(nearest: &[(u32, u8); NEIGHBOURS]) -> u32 {
-    let [.., (farthest, _)] = nearest;
-    *farthest
-}
+/// Coordinates that differ by more count as differing by this.
+const FAR: i32 = 1 << 14;
 
-fn squared(p: &[u32; 3], q: &[u32; 3]) -> u32 {
-    let along = |p: u32, q: u32| {
-        let steps = p.abs_diff(q).min(1 << 14);
-        steps.wrapping_mul(steps)
-    };
-    let ([px, py, pz], [qx, qy, qz]) = (*p, *q);
-    along(px, qx)
-        .wrapping_add(along(py, qy))
-        .wrapping_add(along(pz, qz))
+/// The nearest so far, near ones first: the distance in space, then, in the lowest byte, in the
+/// order.
+const NONE: [u64; NEIGHBOURS] = [(u32::MAX as u64) << 8; NEIGHBOURS];
+
+/// A distance that a nearer one must be below.
+fn farthest(nearest: &[u64; NEIGHBOURS]) -> i32 {
+    let [.., farthest] = nearest;
+    i32::try_from(farthest >> 8).unwrap_or(i32::MAX)
 }
 
 /// How much farther apart two points count because they face different ways: what is on the other
 /// side of an edge or a wall says little.
 fn turned(squared: u32, p: u8, q: u8) -> u32 {
+    if p == q {
+        return 0;
+    }
     let normal = |code: u8| {
         NORMAL_STEPS
             .get(usize::from(code))
@@ -128,11 +162,9 @@ fn turned(squared: u32, p: u8, q: u8) -> u32 {
 }
 
 /// Keeps a candidate if it is among the nearest; of equally near ones, the nearest in the order.
-fn keep(nearest: &mut [(u32, u8); NEIGHBOURS], mut candidate: (u32, u8)) {
+fn keep(nearest: &mut [u64; NEIGHBOURS], mut candidate: u64) {
     for kept in nearest {
-        if candidate < *kept {
-            core::mem::swap(kept, &mut candidate);
-        }
+        (*kept, candidate) = ((*kept).min(candidate), (*kept).max(candidate));
     }
 }
 
@@ -301,19 +333,6 @@ struct Contexts {
     down: [Odds; 20],
     /// It goes further.
     more: [[Odds; ACTIVITIES]; UNARY],
-}
-
-const fn odds<const N: usize>(starts: [u8; N]) -> [Odds; N] {
-    let mut odds = [Odds::new(128); N];
-    let mut at = 0;
-    while at < N {
-        #[allow(clippy::indexing_slicing, clippy::arithmetic_side_effects)]
-        {
-            odds[at] = Odds::new(starts[at]);
-            at += 1;
-        }
-    }
-    odds
 }
 
 /// What is learnt starts anew with every slice, from what is usual.
@@ -689,6 +708,16 @@ mod tests {
         }
     }
 
+    fn patch(positions: &[[u32; 3]], normals: &[u8]) -> Vec<PatchPoint> {
+        let pairs = positions.iter().zip(normals);
+        let point = |(position, normal): (&[u32; 3], &u8)| PatchPoint {
+            position: *position,
+            normal: *normal,
+            ..PatchPoint::default()
+        };
+        pairs.map(point).collect()
+    }
+
     /// A slice on two walls, and a shadow that wanders over it.
     struct Scene {
         positions: Vec<[u32; 3]>,
@@ -709,7 +738,7 @@ mod tests {
                 normals.push(if u < fold { 0x77 } else { 0x7e });
             }
             let mut neighbours = vec![Neighbours::default(); points];
-            find_neighbours(&positions, &normals, &mut neighbours);
+            find_neighbours(&patch(&positions, &normals), false, &mut neighbours);
             Scene {
                 positions,
                 neighbours,
@@ -1013,12 +1042,57 @@ mod tests {
             .map(|at| if at % 2 == 0 { 0x77 } else { 0 })
             .collect();
         let mut found = vec![Neighbours::default(); 64];
-        find_neighbours(&positions, &normals, &mut found);
+        find_neighbours(&patch(&positions, &normals), false, &mut found);
         assert!(
             found[10..54]
                 .iter()
                 .all(|n| n.earlier[0] % 2 == 0 && n.later[0] % 2 == 0)
         );
+    }
+
+    #[test]
+    fn neighbours_are_those_of_a_search_through_all_pairs() {
+        let mut random = Random(5);
+        for (count, spread) in [(1, 9), (2, 1), (40, 3), (300, 40), (1024, 1 << 25)] {
+            let points: Vec<PatchPoint> = (0..count)
+                .map(|_| PatchPoint {
+                    position: [0; 3].map(|_| random.below(spread)),
+                    normal: random.below(3) as u8 * 0x33,
+                    ..PatchPoint::default()
+                })
+                .collect();
+            let apart = |p: &PatchPoint, q: &PatchPoint| {
+                let far = p.position.iter().zip(&q.position);
+                let squared = far
+                    .map(|(p, q)| p.abs_diff(*q).min(FAR as u32).pow(2))
+                    .sum();
+                u32::saturating_add(squared, turned(squared, p.normal, q.normal))
+            };
+            for first in [false, true] {
+                let mut found = vec![Neighbours::default(); count];
+                find_neighbours(&points, first, &mut found);
+                let window = if first { WINDOW_FIRST } else { WINDOW };
+                for (at, found) in found.iter().enumerate() {
+                    let three = |mut all: Vec<(u32, u8)>| {
+                        all.retain(|(apart, _)| *apart < u32::MAX);
+                        all.sort_unstable();
+                        all.extend([(0, 0); 3]);
+                        [all[0].1, all[1].1, all[2].1]
+                    };
+                    let back = (1..=window.min(at))
+                        .map(|by| (apart(&points[at], &points[at - by]), by as u8));
+                    assert_eq!(found.earlier, three(back.collect()), "{at} of {count}");
+                    let forward = (1..=window.min(count - 1 - at))
+                        .map(|by| (apart(&points[at], &points[at + by]), by as u8));
+                    let expected = if first {
+                        [0; 3]
+                    } else {
+                        three(forward.collect())
+                    };
+                    assert_eq!(found.later, expected, "{at} of {count}");
+                }
+            }
+        }
     }
 
     #[test]
@@ -1044,6 +1118,6 @@ mod tests {
                 sides[1].last.iter().for_each(|last| add(*last as u8));
             }
         }
-        assert_eq!(hash, 4270648226467247846);
+        assert_eq!(hash, 12685251247814274810);
     }
 }

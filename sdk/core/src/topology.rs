@@ -1,8 +1,8 @@
 //! Topology: where a mesh's points are, in patches of up to [`PATCH_POINTS`], compactly coded.
 //!
-//! A patch is coded by [`code_points`], the same function for writer and reader. Its points lie in
-//! Morton order, so that each begins like the one before it; what is left of a position is plain
-//! along the surface, and predicted from the surface's normal across it.
+//! A patch is coded by [`code_points`], the same function for writer and reader. It is halved again
+//! and again, and how many points each half has is coded, until a part has one point. What is left
+//! of that point's position is plain along the surface, and predicted from its normal across it.
 #![deny(
     clippy::unwrap_used,
     clippy::panic,
@@ -11,7 +11,7 @@
 )]
 
 use crate::point::NORMAL_STEPS;
-use crate::range::{Decoder, Encoder, Full, Odds};
+use crate::range::{Decoder, Encoder, Full, Odds, odds};
 use crate::stream::{Reader, StreamError, Writer};
 use bytemuck::{Pod, Zeroable};
 
@@ -78,7 +78,7 @@ pub fn encode_patch(points: &[PatchPoint], out: &mut [u8]) -> Result<usize, Full
     {
         return Err(Full);
     }
-    let mut frame = order.0;
+    let frame = order.0;
     let mut w = Writer::new(out);
     let head = |w: &mut Writer<'_>| {
         w.varint(points.len() as u32)?;
@@ -88,7 +88,7 @@ pub fn encode_patch(points: &[PatchPoint], out: &mut [u8]) -> Result<usize, Full
     head(&mut w).map_err(|_| Full)?;
     let start = w.length();
     let mut side = Encode(Encoder::new(out.get_mut(start..).ok_or(Full)?));
-    code_points(&mut side, &mut frame, copy).map_err(|_| Full)?;
+    code_points(&mut side, &frame, copy).map_err(|_| Full)?;
     Ok(start.saturating_add(side.0.finish()?))
 }
 
@@ -105,10 +105,10 @@ pub fn decode_patch(bytes: &[u8], points: &mut [PatchPoint]) -> Result<usize, St
         return Err(StreamError::Value);
     }
     let origin = [r.varint()?, r.varint()?, r.varint()?];
-    let mut frame = Frame::new(origin, r.array()?)?;
+    let frame = Frame::new(origin, r.array()?)?;
     let points = points.get_mut(..count).ok_or(StreamError::Length)?;
     let mut side = Decode(Decoder::new(r.0));
-    code_points(&mut side, &mut frame, points)?;
+    code_points(&mut side, &frame, points)?;
     side.0.finish()?;
     Ok(count)
 }
@@ -202,12 +202,12 @@ impl Frame {
         })
     }
 
-    /// The first depth at which two offsets differ; the number of depths if they are equal.
-    fn differs_at(&self, a: [u32; 3], b: [u32; 3]) -> usize {
-        let differs = |(axis, left): &(u8, [u8; 3])| {
-            (get(&a, *axis) ^ get(&b, *axis)) >> get(left, *axis) & 1 != 0
-        };
-        self.order().iter().position(differs).unwrap_or(self.depths)
+    /// Bits of each axis from a depth on.
+    fn left(&self, depth: usize) -> [u8; 3] {
+        match depth.checked_sub(1) {
+            None => self.bits,
+            Some(above) => self.order().get(above).map_or([0; 3], |(_, left)| *left),
+        }
     }
 }
 
@@ -221,6 +221,8 @@ trait Side {
     fn bit(&mut self, odds: &mut Odds, wanted: bool) -> bool;
     /// Codes a plain number of up to 16 bits.
     fn bits(&mut self, count: u32, wanted: u32) -> u32;
+    /// How many points have a 0 in this bit of an axis (not asked for when reading).
+    fn below(&self, points: &[PatchPoint], frame: &Frame, axis: u8, left: [u8; 3]) -> usize;
 }
 
 struct Encode<'a>(Encoder<'a>);
@@ -236,6 +238,11 @@ impl Side for Encode<'_> {
         self.0.bits(count, wanted & mask);
         wanted & mask
     }
+
+    fn below(&self, points: &[PatchPoint], frame: &Frame, axis: u8, left: [u8; 3]) -> usize {
+        let bit = |p: &PatchPoint| get(&frame.offset(p.position), axis) >> get(&left, axis) & 1;
+        points.partition_point(|point| bit(point) == 0)
+    }
 }
 
 struct Decode<'a>(Decoder<'a>);
@@ -247,6 +254,10 @@ impl Side for Decode<'_> {
 
     fn bits(&mut self, count: u32, _: u32) -> u32 {
         self.0.bits(count)
+    }
+
+    fn below(&self, _: &[PatchPoint], _: &Frame, _: u8, _: [u8; 3]) -> usize {
+        0
     }
 }
 
@@ -260,6 +271,15 @@ fn plain<S: Side>(side: &mut S, count: u32, wanted: u32) -> u32 {
 
 /// The odds of all kinds of decisions; they start anew with every patch.
 struct Contexts {
+    /// A part of the patch has points on both sides of its middle: by how long it is, how many
+    /// points it has, and how it was with the last such part.
+    both: [[[Odds; STATES]; 3]; POSITION_BITS as usize],
+    /// Otherwise, all are above.
+    above: [Odds; STATES],
+    /// How many are below: for few points, a tree for each number.
+    few: [[Odds; 16]; 17],
+    /// For many, a tree of 16ths.
+    many: [Odds; 16],
     /// By the level of the point before, and how far the level has got.
     level: [[Odds; 3]; LEVELS as usize],
     /// The normal is that of the point before; by whether that was so there.
@@ -270,29 +290,255 @@ struct Contexts {
     turn_some: [Odds; 3],
     turn_down: [Odds; 2],
     turn_more: [[Odds; 6]; 2],
-    /// Where the position differs from the one before: a tree of 7 decisions.
-    depth: [[Odds; 128]; 2],
     /// Across the surface: bits of the distance from the prediction, and its sign.
     across: [[Odds; POSITION_BITS as usize + 2]; 4 * 2],
-    above: Odds,
+    up: Odds,
 }
+
+/// What the last part of the same size was like: none yet, points on both sides, all below, all
+/// above.
+const STATES: usize = 4;
 
 impl Contexts {
     const START: Contexts = Contexts {
-        level: [[Odds::new(128); 3]; LEVELS as usize],
-        same: [Odds::new(128); 2],
-        again: Odds::new(128),
-        turn_some: [Odds::new(128); 3],
-        turn_down: [Odds::new(128); 2],
-        turn_more: [[Odds::new(128); 6]; 2],
-        depth: [[Odds::new(128); 128]; 2],
-        across: [[Odds::new(128); POSITION_BITS as usize + 2]; 4 * 2],
-        above: Odds::new(128),
+        both: [
+            [
+                odds([117, 127, 126, 127]),
+                odds([128, 128, 128, 128]),
+                odds([128, 128, 128, 128]),
+            ],
+            [
+                odds([118, 126, 116, 123]),
+                odds([128, 128, 128, 128]),
+                odds([128, 128, 128, 128]),
+            ],
+            [
+                odds([118, 125, 114, 104]),
+                odds([128, 128, 129, 129]),
+                odds([128, 128, 128, 128]),
+            ],
+            [
+                odds([170, 209, 111, 122]),
+                odds([132, 176, 155, 149]),
+                odds([128, 128, 128, 128]),
+            ],
+            [
+                odds([154, 209, 137, 158]),
+                odds([182, 249, 183, 196]),
+                odds([142, 250, 212, 213]),
+            ],
+            [
+                odds([82, 163, 17, 13]),
+                odds([162, 243, 71, 88]),
+                odds([206, 253, 99, 147]),
+            ],
+            [
+                odds([92, 56, 17, 22]),
+                odds([91, 122, 24, 36]),
+                odds([183, 248, 74, 142]),
+            ],
+            [
+                odds([110, 67, 53, 99]),
+                odds([112, 84, 39, 83]),
+                odds([151, 219, 87, 125]),
+            ],
+            [
+                odds([123, 116, 109, 121]),
+                odds([123, 108, 98, 118]),
+                odds([165, 183, 74, 121]),
+            ],
+            [
+                odds([127, 126, 123, 127]),
+                odds([126, 124, 124, 127]),
+                odds([205, 101, 66, 113]),
+            ],
+            [
+                odds([128, 128, 127, 128]),
+                odds([128, 127, 126, 128]),
+                odds([182, 101, 96, 120]),
+            ],
+            [
+                odds([128, 128, 128, 128]),
+                odds([128, 128, 128, 128]),
+                odds([147, 122, 123, 127]),
+            ],
+            [
+                odds([128, 128, 128, 128]),
+                odds([128, 128, 128, 128]),
+                odds([131, 127, 127, 128]),
+            ],
+            [
+                odds([128, 128, 128, 128]),
+                odds([128, 128, 128, 128]),
+                odds([128, 128, 128, 128]),
+            ],
+            [
+                odds([128, 128, 128, 128]),
+                odds([128, 128, 128, 128]),
+                odds([128, 128, 128, 128]),
+            ],
+            [
+                odds([128, 128, 128, 128]),
+                odds([128, 128, 128, 128]),
+                odds([128, 128, 128, 128]),
+            ],
+            [
+                odds([128, 128, 128, 128]),
+                odds([128, 128, 128, 128]),
+                odds([128, 128, 128, 128]),
+            ],
+            [
+                odds([128, 128, 128, 128]),
+                odds([128, 128, 128, 128]),
+                odds([128, 128, 128, 128]),
+            ],
+            [
+                odds([128, 128, 128, 128]),
+                odds([128, 128, 128, 128]),
+                odds([128, 128, 128, 128]),
+            ],
+            [
+                odds([128, 128, 128, 128]),
+                odds([128, 128, 128, 128]),
+                odds([128, 128, 128, 128]),
+            ],
+            [
+                odds([128, 128, 128, 128]),
+                odds([128, 128, 128, 128]),
+                odds([128, 128, 128, 128]),
+            ],
+            [
+                odds([128, 128, 128, 128]),
+                odds([128, 128, 128, 128]),
+                odds([128, 128, 128, 128]),
+            ],
+            [
+                odds([128, 128, 128, 128]),
+                odds([128, 128, 128, 128]),
+                odds([128, 128, 128, 128]),
+            ],
+            [
+                odds([128, 128, 128, 128]),
+                odds([128, 128, 128, 128]),
+                odds([128, 128, 128, 128]),
+            ],
+            [
+                odds([128, 128, 128, 128]),
+                odds([128, 128, 128, 128]),
+                odds([128, 128, 128, 128]),
+            ],
+        ],
+        above: odds([156, 115, 32, 232]),
+        many: odds([
+            128, 142, 140, 130, 238, 153, 227, 211, 153, 45, 32, 100, 44, 105, 145, 151,
+        ]),
+        same: odds([253, 142]),
+        turn_some: odds([205, 253, 179]),
+        turn_down: odds([118, 129]),
+        few: [
+            odds([
+                128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128,
+            ]),
+            odds([
+                128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128,
+            ]),
+            odds([
+                128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128,
+            ]),
+            odds([
+                128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128,
+            ]),
+            odds([
+                128, 204, 61, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128,
+            ]),
+            odds([
+                128, 222, 121, 34, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128,
+            ]),
+            odds([
+                128, 222, 195, 82, 40, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128,
+            ]),
+            odds([
+                128, 248, 207, 125, 56, 42, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128,
+            ]),
+            odds([
+                128, 246, 223, 193, 87, 20, 70, 128, 128, 128, 128, 128, 128, 128, 128, 128,
+            ]),
+            odds([
+                128, 159, 239, 198, 134, 60, 24, 89, 128, 128, 128, 128, 128, 128, 128, 128,
+            ]),
+            odds([
+                128, 152, 214, 199, 179, 98, 44, 121, 88, 128, 128, 128, 128, 128, 128, 128,
+            ]),
+            odds([
+                128, 143, 236, 229, 178, 131, 89, 52, 112, 94, 128, 128, 128, 128, 128, 128,
+            ]),
+            odds([
+                128, 139, 239, 234, 192, 179, 119, 77, 22, 109, 111, 128, 128, 128, 128, 128,
+            ]),
+            odds([
+                128, 159, 141, 244, 239, 187, 134, 89, 57, 15, 128, 124, 128, 128, 128, 128,
+            ]),
+            odds([
+                128, 150, 139, 243, 244, 199, 177, 111, 60, 11, 108, 99, 122, 128, 128, 128,
+            ]),
+            odds([
+                128, 146, 134, 246, 159, 238, 181, 127, 88, 51, 20, 118, 118, 128, 128, 128,
+            ]),
+            odds([
+                128, 149, 130, 240, 138, 235, 196, 169, 102, 34, 73, 16, 126, 107, 129, 128,
+            ]),
+        ],
+        level: [
+            odds([153, 130, 126]),
+            odds([117, 149, 135]),
+            odds([86, 97, 148]),
+            odds([100, 86, 86]),
+        ],
+        turn_more: [
+            odds([121, 140, 171, 150, 157, 148]),
+            odds([103, 129, 232, 250, 247, 196]),
+        ],
+        across: [
+            odds([
+                224, 203, 174, 130, 93, 30, 107, 119, 127, 127, 128, 128, 128, 128, 128, 128, 128,
+                128, 128, 128, 128, 128, 128, 128, 128, 128, 128,
+            ]),
+            odds([
+                3, 226, 246, 231, 191, 27, 28, 93, 122, 126, 128, 128, 128, 128, 128, 128, 128,
+                128, 128, 128, 128, 128, 128, 128, 128, 128, 128,
+            ]),
+            odds([
+                224, 200, 162, 119, 76, 33, 102, 126, 127, 128, 128, 128, 128, 128, 128, 128, 128,
+                128, 128, 128, 128, 128, 128, 128, 128, 128, 128,
+            ]),
+            odds([
+                66, 118, 160, 177, 127, 67, 121, 126, 127, 128, 128, 128, 128, 128, 128, 128, 128,
+                128, 128, 128, 128, 128, 128, 128, 128, 128, 128,
+            ]),
+            odds([
+                227, 210, 163, 111, 61, 54, 96, 123, 128, 128, 128, 128, 128, 128, 128, 128, 128,
+                128, 128, 128, 128, 128, 128, 128, 128, 128, 128,
+            ]),
+            odds([
+                71, 163, 132, 137, 106, 96, 122, 127, 128, 128, 128, 128, 128, 128, 128, 128, 128,
+                128, 128, 128, 128, 128, 128, 128, 128, 128, 128,
+            ]),
+            odds([
+                233, 221, 183, 129, 60, 33, 80, 123, 127, 128, 128, 128, 128, 128, 128, 128, 128,
+                128, 128, 128, 128, 128, 128, 128, 128, 128, 128,
+            ]),
+            odds([
+                54, 187, 199, 169, 122, 56, 95, 124, 127, 127, 128, 128, 128, 128, 128, 128, 128,
+                128, 128, 128, 128, 128, 128, 128, 128, 128, 128,
+            ]),
+        ],
+        again: Odds::new(191),
+        up: Odds::new(125),
     };
 }
 
 /// How many points back one may lean on.
-const BACK: usize = 16;
+const BACK: usize = 8;
 
 /// What the points so far say of the next.
 struct History {
@@ -300,14 +546,24 @@ struct History {
     other: [u8; 2],
     same: bool,
     level: u8,
-    depth: usize,
     across: u32,
+    /// The state of each depth.
+    states: [u8; DEPTHS],
 }
 
-/// Codes all points of a patch, in its order. The reader's `points` become what was read.
+/// A part of the patch: what its points' offsets have in common, and how many they are.
+#[derive(Clone, Copy, Default)]
+struct Part {
+    offset: [u32; 3],
+    depth: usize,
+    count: usize,
+}
+
+/// Codes all points of a patch, in its order: the patch is halved again and again, until a part
+/// has one point. The reader's `points` become what was read.
 fn code_points<S: Side>(
     side: &mut S,
-    frame: &mut Frame,
+    frame: &Frame,
     points: &mut [PatchPoint],
 ) -> Result<(), StreamError> {
     let mut odds = Contexts::START;
@@ -316,39 +572,165 @@ fn code_points<S: Side>(
         other: [7; 2],
         same: true,
         level: 0,
-        depth: 0,
         across: 0,
+        states: [0; DEPTHS],
     };
-    for at in 0..points.len() {
-        let Some((done, [point, ..])) = points.split_at_mut_checked(at) else {
+    // The upper halves that wait: one a depth at most.
+    let mut waiting = [Part::default(); DEPTHS];
+    let mut waits = 0usize;
+    let mut part = Part {
+        count: points.len(),
+        ..Part::default()
+    };
+    let mut at = 0usize;
+    loop {
+        while let (2.., Some(&(axis, left))) = (part.count, frame.order().get(part.depth)) {
+            let end = at.saturating_add(part.count);
+            let wanted = side.below(points.get(at..end).unwrap_or_default(), frame, axis, left);
+            let below = code_below(
+                side,
+                &mut odds,
+                &mut history,
+                &part,
+                get(&left, axis),
+                wanted,
+            )?;
+            let depth = part.depth.saturating_add(1);
+            let mut upper = Part {
+                depth,
+                count: part.count.saturating_sub(below),
+                ..part
+            };
+            if let Some(offset) = upper.offset.get_mut(usize::from(axis)) {
+                *offset |= 1u32.checked_shl(u32::from(get(&left, axis))).unwrap_or(0);
+            }
+            let lower = Part {
+                depth,
+                count: below,
+                ..part
+            };
+            part = if below == 0 { upper } else { lower };
+            if below > 0 && upper.count > 0 {
+                *waiting.get_mut(waits).ok_or(StreamError::Value)? = upper;
+                waits = waits.saturating_add(1);
+            }
+        }
+        for _ in 0..part.count {
+            let Some((done, [point, ..])) = points.split_at_mut_checked(at) else {
+                return Err(StreamError::Value);
+            };
+            let back = done.get(at.saturating_sub(BACK)..).unwrap_or_default();
+            *point = code_point(side, &mut odds, frame, &mut history, back, &part, *point)?;
+            at = at.saturating_add(1);
+        }
+        let Some(next) = waits.checked_sub(1) else {
+            return Ok(());
+        };
+        waits = next;
+        part = waiting.get(next).copied().unwrap_or_default();
+    }
+}
+
+/// How many of a part's points lie below its middle.
+fn code_below<S: Side>(
+    side: &mut S,
+    odds: &mut Contexts,
+    history: &mut History,
+    part: &Part,
+    left: u8,
+    wanted: usize,
+) -> Result<usize, StreamError> {
+    let count = part.count;
+    let class = match count {
+        2 => 0,
+        3 | 4 => 1,
+        _ => 2,
+    };
+    let state = history
+        .states
+        .get_mut(part.depth)
+        .ok_or(StreamError::Value)?;
+    let odds_both = odds
+        .both
+        .get_mut(usize::from(left))
+        .and_then(|row| row.get_mut(class))
+        .and_then(|row| row.get_mut(usize::from(*state)));
+    let odds_above = odds.above.get_mut(usize::from(*state));
+    let (Some(odds_both), Some(odds_above)) = (odds_both, odds_above) else {
+        return Err(StreamError::Value);
+    };
+    if !side.bit(odds_both, wanted != 0 && wanted != count) {
+        let above = side.bit(odds_above, wanted == 0);
+        *state = if above { 3 } else { 2 };
+        return Ok(if above { 0 } else { count });
+    }
+    *state = 1;
+    if count <= 16 {
+        // From 1 on, all below the count.
+        let tree = odds.few.get_mut(count).ok_or(StreamError::Value)?;
+        let values = count.saturating_sub(1);
+        let value = code_tree(side, tree, values, wanted.saturating_sub(1));
+        return Ok(value.saturating_add(1));
+    }
+    let sixteenth = |below: usize| (below << 4).checked_div(count).unwrap_or(0);
+    let part = code_tree(side, &mut odds.many, 16, sixteenth(wanted));
+    // The first with this 16th, and how many bits those with it need.
+    let first = part.wrapping_mul(count).div_ceil(16);
+    let bits = usize::BITS.wrapping_sub((count >> 4).leading_zeros());
+    let more = side.bits(bits, wanted.wrapping_sub(first) as u32) as usize;
+    let below = first.saturating_add(more);
+    let inside = (1..count).contains(&below);
+    inside.then_some(below).ok_or(StreamError::Value)
+}
+
+/// A number below `values`, at most 16: halves of what is left, as long as there are two.
+fn code_tree<S: Side>(side: &mut S, odds: &mut [Odds; 16], values: usize, wanted: usize) -> usize {
+    let (mut low, mut high) = (0usize, values);
+    while high.saturating_sub(low) > 1 {
+        // Each middle comes up on one way only, so it names the odds.
+        let middle = low.midpoint(high);
+        let Some(odds) = odds.get_mut(middle) else {
             break;
         };
-        let level = code_level(
-            side,
-            odds.level.get_mut(usize::from(history.level)),
-            point.level,
-        );
-        history.level = level;
-        let normal = code_normal(side, &mut odds, &mut history, split_normal(point.normal))?;
-        let back = done.get(at.saturating_sub(BACK)..).unwrap_or_default();
-        let normal = normal_code(normal);
-        let position = code_position(
-            side,
-            &mut odds,
-            frame,
-            &mut history,
-            back,
-            normal,
-            point.position,
-        )?;
-        *point = PatchPoint {
-            position,
-            normal,
-            level,
-            reserved: [0; 2],
-        };
+        if side.bit(odds, wanted >= middle) {
+            low = middle;
+        } else {
+            high = middle;
+        }
     }
-    Ok(())
+    low
+}
+
+fn code_point<S: Side>(
+    side: &mut S,
+    odds: &mut Contexts,
+    frame: &Frame,
+    history: &mut History,
+    back: &[PatchPoint],
+    part: &Part,
+    wanted: PatchPoint,
+) -> Result<PatchPoint, StreamError> {
+    let level_odds = odds.level.get_mut(usize::from(history.level));
+    let level = code_level(side, level_odds, wanted.level);
+    history.level = level;
+    let normal = code_normal(side, odds, history, split_normal(wanted.normal))?;
+    let normal = normal_code(normal);
+    let position = code_position(
+        side,
+        odds,
+        frame,
+        history,
+        back,
+        normal,
+        part,
+        wanted.position,
+    )?;
+    Ok(PatchPoint {
+        position,
+        normal,
+        level,
+        reserved: [0; 2],
+    })
 }
 
 fn code_level<S: Side>(side: &mut S, odds: Option<&mut [Odds; 3]>, wanted: u8) -> u8 {
@@ -432,41 +814,11 @@ fn code_position<S: Side>(
     history: &mut History,
     back: &[PatchPoint],
     normal: u8,
+    part: &Part,
     wanted: [u32; 3],
 ) -> Result<[u32; 3], StreamError> {
     let wanted = frame.offset(wanted);
-    // The bits that it shares with the point before, and how many are left of each axis.
-    let (mut offset, left) = match back.last() {
-        None => ([0; 3], frame.bits),
-        Some(last) => {
-            let last = frame.offset(last.position);
-            let set = odds
-                .depth
-                .get_mut(usize::from(history.depth.is_multiple_of(2)));
-            let depth = code_depth(side, set, frame.differs_at(last, wanted));
-            history.depth = depth;
-            match frame.order().get(depth) {
-                // The same position once more.
-                None if depth == frame.depths => (last, [0; 3]),
-                None => return Err(StreamError::Value),
-                Some(&(axis, left)) => {
-                    let mut kept = last;
-                    for (at, (kept, left)) in kept.iter_mut().zip(left).enumerate() {
-                        *kept = kept.checked_shr(u32::from(left)).unwrap_or(0);
-                        if at == usize::from(axis) {
-                            // It comes after the one before, so the first bit to differ is a 1.
-                            if *kept & 1 != 0 {
-                                return Err(StreamError::Value);
-                            }
-                            *kept |= 1;
-                        }
-                        *kept = kept.checked_shl(u32::from(left)).unwrap_or(0);
-                    }
-                    (kept, left)
-                }
-            }
-        }
-    };
+    let (mut offset, left) = (part.offset, frame.left(part.depth));
     let steps = NORMAL_STEPS
         .get(usize::from(normal))
         .copied()
@@ -512,20 +864,6 @@ fn code_position<S: Side>(
     fits.then_some(position).ok_or(StreamError::Value)
 }
 
-/// A depth, the highest of 7 bits first.
-fn code_depth<S: Side>(side: &mut S, odds: Option<&mut [Odds; 128]>, wanted: usize) -> usize {
-    let mut node = 1usize;
-    if let Some(odds) = odds {
-        for bit in (0..7).rev() {
-            let Some(odds) = odds.get_mut(node) else {
-                break;
-            };
-            node = node << 1 | usize::from(side.bit(odds, wanted >> bit & 1 != 0));
-        }
-    }
-    node & 127
-}
-
 /// Where the plane through the nearest point so far says that a point is, across the surface.
 fn predict(
     frame: &Frame,
@@ -535,35 +873,42 @@ fn predict(
     across: usize,
     offset: [u32; 3],
 ) -> u32 {
-    let mut nearest = (u32::MAX, 0i64);
+    let of = |offset: [u32; 3]| {
+        let [x, y, z] = offset.map(i64::from);
+        match across {
+            0 => [y, z, x],
+            1 => [x, z, y],
+            _ => [x, y, z],
+        }
+    };
+    let [u, v, _] = of(offset);
+    let mut nearest = (i64::MAX, [0; 3]);
     for point in back.iter().rev() {
-        let from = frame.offset(point.position);
-        let (mut far, mut slope, mut base) = (0u32, 0i64, 0i64);
-        let axes = offset.iter().zip(&from).zip(steps);
-        for (axis, ((to, from), step)) in axes.enumerate() {
-            if axis == across {
-                base = i64::from(*from);
-            } else {
-                far = far.saturating_add(to.abs_diff(*from));
-                let by = i64::from(*to).wrapping_sub(i64::from(*from));
-                slope = slope.wrapping_add(by.wrapping_mul(i64::from(*step)));
-            }
-        }
-        if point.normal != normal {
-            far = far.saturating_add(64);
-        }
+        let [from_u, from_v, from] = of(frame.offset(point.position));
+        let (by_u, by_v) = (u.wrapping_sub(from_u), v.wrapping_sub(from_v));
+        let turned = i64::from(point.normal != normal) << 6;
+        let far = by_u.abs().wrapping_add(by_v.abs()).wrapping_add(turned);
         if far < nearest.0 {
-            let rise = i64::from(steps.get(across).copied().unwrap_or(1));
-            // Rounded to the nearest, halves up.
-            let double = slope.wrapping_mul(2).wrapping_mul(rise.signum());
-            let rise = rise.abs();
-            let moved = double
-                .wrapping_add(rise)
-                .div_euclid(rise.wrapping_mul(2).max(1));
-            nearest = (far, base.wrapping_sub(moved));
+            nearest = (far, [by_u, by_v, from]);
         }
     }
-    nearest.1.clamp(0, i64::from(u32::MAX)) as u32
+    let [by_u, by_v, from] = nearest.1;
+    let [x, y, z] = steps.map(i64::from);
+    let [step_u, step_v, rise] = match across {
+        0 => [y, z, x],
+        1 => [x, z, y],
+        _ => [x, y, z],
+    };
+    let slope = by_u
+        .wrapping_mul(step_u)
+        .wrapping_add(by_v.wrapping_mul(step_v));
+    // Rounded to the nearest, halves up.
+    let double = slope.wrapping_mul(2).wrapping_mul(rise.signum());
+    let rise = rise.abs();
+    let moved = double
+        .wrapping_add(rise)
+        .div_euclid(rise.wrapping_mul(2).max(1));
+    from.wrapping_sub(moved).clamp(0, i64::from(u32::MAX)) as u32
 }
 
 /// The offset across the surface, between `low` and `high`.
@@ -597,7 +942,7 @@ fn code_across<S: Side>(
     } else if predicted == high {
         false
     } else {
-        side.bit(&mut odds.above, wanted > predicted)
+        side.bit(&mut odds.up, wanted > predicted)
     };
     let value = if above {
         predicted.checked_add(far)
@@ -606,4 +951,132 @@ fn code_across<S: Side>(
     };
     let inside = value.filter(|value| (low..=high).contains(value));
     inside.ok_or(StreamError::Value)
+}
+
+#[cfg(test)]
+#[allow(
+    clippy::indexing_slicing,
+    clippy::unwrap_used,
+    clippy::arithmetic_side_effects
+)]
+mod tests {
+    extern crate std;
+    use super::*;
+    use std::vec;
+    use std::vec::Vec;
+
+    struct Random(u32);
+
+    impl Random {
+        fn below(&mut self, limit: u32) -> u32 {
+            self.0 = self.0.wrapping_mul(747796405).wrapping_add(2891336453);
+            let mixed = (self.0 >> 16 ^ self.0).wrapping_mul(0x7feb352d);
+            (mixed ^ mixed >> 15) % limit
+        }
+    }
+
+    fn sorted(mut points: Vec<PatchPoint>) -> Vec<PatchPoint> {
+        let order = Order::of(&points);
+        points.sort_by_key(|point| order.key(point));
+        points
+    }
+
+    /// Points all over a box, or on a slope in it, or all in one place.
+    fn points(random: &mut Random, count: usize) -> Vec<PatchPoint> {
+        let kind = random.below(4);
+        let extent = 1 << random.below(POSITION_BITS + 1);
+        let from = [0; 3].map(|_| random.below((1 << POSITION_BITS) - extent + 1));
+        let normals = 1 + random.below(225);
+        let point = |random: &mut Random| {
+            let [u, v, w] = [0; 3].map(|_| random.below(extent));
+            let by = match kind {
+                0 => [u, v, w],
+                1 => [u, v, (u + v) / 2],
+                2 => [u, extent / 2, v],
+                _ => [extent - 1; 3],
+            };
+            let normal = random.below(normals) as u8;
+            PatchPoint {
+                position: [from[0] + by[0], from[1] + by[1], from[2] + by[2]],
+                normal: normal_code([normal % 15, normal / 15]),
+                level: random.below(LEVELS) as u8,
+                reserved: [0; 2],
+            }
+        };
+        (0..count).map(|_| point(random)).collect()
+    }
+
+    #[test]
+    fn patches_are_read_as_they_were_written() {
+        let mut random = Random(3);
+        let mut bytes = vec![0; MAX_PATCH_BYTES];
+        for case in 0..400 {
+            let count = [1, 2, 17, 300, PATCH_POINTS][case % 5];
+            let points = sorted(points(&mut random, count));
+            let length = encode_patch(&points, &mut bytes).unwrap();
+            let mut read = vec![PatchPoint::default(); PATCH_POINTS];
+            assert_eq!(
+                decode_patch(&bytes[..length], &mut read),
+                Ok(count),
+                "case {case}"
+            );
+            assert_eq!(read[..count], points, "case {case}");
+        }
+    }
+
+    #[test]
+    fn what_is_no_patch_is_refused_by_writer_and_reader() {
+        let mut random = Random(4);
+        let mut bytes = vec![0; MAX_PATCH_BYTES];
+        let mut good = sorted(points(&mut random, 300));
+        let length = encode_patch(&good, &mut bytes).unwrap();
+        let bytes = &bytes[..length];
+        let mut read = vec![PatchPoint::default(); PATCH_POINTS];
+        // Damage may leave another patch: checksum and hash are for that.
+        let cut = (0..length).filter(|&end| decode_patch(&bytes[..end], &mut read).is_ok());
+        assert!(cut.count() < 4);
+        assert!(decode_patch(bytes, &mut read[..299]).is_err());
+        let mut wrong = 0;
+        for at in 0..length * 8 {
+            let mut bytes = bytes.to_vec();
+            bytes[at / 8] ^= 1 << (at % 8);
+            wrong += usize::from(decode_patch(&bytes, &mut read) != Ok(300));
+        }
+        assert!(wrong * 2 > length * 8, "{wrong} of {} noticed", length * 8);
+        let refused = |points: &[PatchPoint]| {
+            assert_eq!(
+                encode_patch(points, &mut vec![0; MAX_PATCH_BYTES]),
+                Err(Full)
+            );
+        };
+        refused(&[]);
+        refused(&vec![good[0]; PATCH_POINTS + 1]);
+        good.reverse();
+        refused(&good);
+        for spoil in [
+            |point: &mut PatchPoint| point.level = LEVELS as u8,
+            |point: &mut PatchPoint| point.normal = 0xf7,
+            |point: &mut PatchPoint| point.position[1] = 1 << POSITION_BITS,
+        ] {
+            let mut point = good[0];
+            spoil(&mut point);
+            refused(&[point]);
+        }
+        assert_eq!(encode_patch(&good[..1], &mut []), Err(Full));
+    }
+
+    #[test]
+    fn patches_are_the_same_on_every_machine() {
+        let mut random = Random(6);
+        let mut bytes = vec![0; MAX_PATCH_BYTES];
+        let mut hash = 0xcbf2_9ce4_8422_2325u64;
+        for case in 0..60 {
+            let points = sorted(points(&mut random, [1, 50, 700][case % 3]));
+            let length = encode_patch(&points, &mut bytes).unwrap();
+            for byte in &bytes[..length] {
+                hash = (hash ^ u64::from(*byte)).wrapping_mul(0x100_0000_01b3);
+            }
+        }
+        assert_eq!(hash, 7360299150515250600);
+    }
 }

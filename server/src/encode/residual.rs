@@ -4,6 +4,7 @@ use super::{Compression, FrameStats, View, capacity_of, compress, compressor, wr
 use crate::world::{Slice, World};
 use glam::Vec3;
 use psao::memory::{Heap, SliceHeap};
+use psao_core::bins::Bin;
 use psao_core::mirror::Capacity;
 use psao_core::residual::{MAX_SLICE_BYTES, Quantiser, SliceState, encode_slice};
 use psao_core::slices::{self, FIRST, ITEM_HEADER_BYTES, Item, Operation};
@@ -11,7 +12,7 @@ use psao_core::stream::{CHANGES_HEADER_BYTES, Writer, kind};
 use psao_core::topology::LEVELS;
 use psao_core::{Instance, Mirror};
 use rayon::prelude::*;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashSet};
 use std::ops::Range;
 
 /// What a client gets at most.
@@ -131,6 +132,21 @@ impl Residual {
         }
     }
 
+    /// Cells that the client has, and that it would have if nothing were left out for being open.
+    pub fn cells(&self, world: &World) -> [usize; 2] {
+        let has = self.mirror.cells().iter().filter(|cell| !cell.is_empty());
+        let mut all = HashSet::new();
+        for (slice, open) in world.slices.iter().zip(self.heap.get()) {
+            if open.point_count > 0 {
+                let grid = self.mirror.instances()[slice.instance as usize];
+                let points = world.topology.points_of(slice.patch, grid.level);
+                let bins = points.filter_map(|point| Bin::of(&grid, point));
+                all.extend(bins.map(|bin| (slice.instance, bin.cell)));
+            }
+        }
+        [has.count(), all.len()]
+    }
+
     pub fn capacity(&self) -> Capacity {
         self.capacity
     }
@@ -239,7 +255,7 @@ impl Residual {
                     let off = off.filter(|off| *off > quantiser.dead_zone);
                     off.map(|off| u64::from(off).pow(2)).sum()
                 };
-                let shows = !opens && to_show(world, mirror, slice, open) != open.shown;
+                let shows = !opens && to_show(world, mirror, slice, open) & !open.shown != 0;
                 if squares == 0 && !shows && !fading {
                     return None;
                 }
@@ -458,7 +474,12 @@ impl Residual {
     fn apply(&mut self, world: &World, coded: Coded, out: &mut Frame, stats: &mut FrameStats) {
         let index = coded.index;
         let slice = self.heap.get()[index as usize];
-        let shown = to_show(world, &self.mirror, &world.slices[index as usize], &slice);
+        // Where something changes once, more will: the rest of the slice comes along, as the client
+        // reads the patch anew each time that blocks come.
+        let shown = match coded.opens {
+            Some(_) => to_show(world, &self.mirror, &world.slices[index as usize], &slice),
+            None => slice.all_blocks(),
+        };
         let mut slices = self.heap.slices();
         let (_, state) = slices.side(&slice).expect("own slices are open");
         let before = state.value.to_vec();
@@ -583,17 +604,14 @@ impl Residual {
     }
 }
 
-/// The blocks that the client should have in cells. Blocks go only when there are many, as each
-/// coming and going costs the client time.
+/// The blocks of a slice that the client must have in cells.
 fn to_show(world: &World, mirror: &Mirror<Heap>, slice: &Slice, open: &slices::Slice) -> u64 {
     let level = mirror.instances()[slice.instance as usize].level;
-    if Some(level) != world.level_of(slice.instance) {
-        return open.all_blocks();
+    if Some(level) == world.level_of(slice.instance) {
+        world.shown(slice) & open.all_blocks()
+    } else {
+        open.all_blocks()
     }
-    let wanted = world.shown(slice) & open.all_blocks();
-    let idle = (open.shown & !wanted).count_ones();
-    let many = idle * 4 >= open.all_blocks().count_ones();
-    if many { wanted } else { wanted | open.shown }
 }
 
 /// A slice without darkness is still a little better had than not.

@@ -1,15 +1,19 @@
 //! Triangles under a tree, in one space.
 
-use glam::{Affine3A, UVec2, Vec3, Vec3A, Vec3Swizzles};
+use std::collections::HashMap;
+
+use glam::{Affine3A, Vec3, Vec3A, Vec3Swizzles};
 use obvhs::{
     BvhBuildParams,
     aabb::Aabb,
     bvh2::{Bvh2, leaf_collapser::collapse, node::Bvh2Node, reinsertion::ReinsertionOptimizer},
-    cwbvh::{CwBvh, bvh2_to_cwbvh::bvh2_to_cwbvh},
+    faststack::FastStack,
     ploc::PlocBuilder,
     ray::{Ray, RayHit},
-    traverse,
 };
+
+use super::fan::Rays;
+use super::lanes::Lanes;
 
 /// For trees that are built once and traced often. On Sponza, dearer builds than this trace no
 /// faster.
@@ -17,8 +21,6 @@ const STATIC: BvhBuildParams = BvhBuildParams::fast_build();
 /// For the tree over movers, built every frame.
 pub(super) const TOP: BvhBuildParams = BvhBuildParams::fastest_build();
 
-/// Levels of a wide tree that the traversal's stack of 32 can hold.
-const MAX_WIDE_DEPTH: usize = 30;
 /// Levels of a binary tree from PLOC beyond which it is a chain rather than a tree.
 const MAX_DEPTH: usize = 96;
 /// Coordinates beyond this would overflow in products.
@@ -66,14 +68,9 @@ impl Corners {
         )
     }
 
-    /// t, and the weights of vertices 1 and 2, of a hit within 0 < t < `ray.tmax`.
-    ///
-    /// The side of each edge that the ray passes on is computed from the edge's ends alone, the
-    /// same for both triangles that share it, up to an exact change of sign: no ray slips through
-    /// between them. (Plücker coordinates, as in Embree's robust mode.)
+    /// The triangle as rays from a place see it.
     #[inline(always)]
-    fn hit(&self, ray: &Ray) -> Option<(f32, f32, f32)> {
-        let (o, d) = (ray.origin, ray.direction);
+    fn seen(&self, o: Vec3A) -> Seen {
         let (x, y, z) = (self.x - o.x, self.y - o.y, self.z - o.z);
         let ex = x.zxy() - x.yzx();
         let ey = y.zxy() - y.yzx();
@@ -81,21 +78,71 @@ impl Corners {
         let sx = x.zxy() + x.yzx();
         let sy = y.zxy() + y.yzx();
         let sz = z.zxy() + z.yzx();
-        let sides =
-            (ey * sz - ez * sy) * d.x + (ez * sx - ex * sz) * d.y + (ex * sy - ey * sx) * d.z;
+        Seen {
+            edges: [ey * sz - ez * sy, ez * sx - ex * sz, ex * sy - ey * sx],
+            normal: self.normal,
+            along_normal: self.normal.dot(Vec3A::new(x.x, y.x, z.x)),
+        }
+    }
+
+    /// The same, unless it is wholly `behind` the plane through `o`.
+    #[inline(always)]
+    pub(super) fn seen_from(&self, o: Vec3A, plane: Vec3A, behind: f32) -> Option<Seen> {
+        let (x, y, z) = (self.x - o.x, self.y - o.y, self.z - o.z);
+        let ahead = x * plane.x + y * plane.y + z * plane.z;
+        (ahead.max_element() >= behind).then(|| self.seen(o))
+    }
+
+    /// t, and the weights of vertices 1 and 2, of a hit within 0 < t < `ray.tmax`.
+    #[inline(always)]
+    fn hit(&self, ray: &Ray) -> Option<(f32, f32, f32)> {
+        let (seen, d) = (self.seen(ray.origin), ray.direction);
+        let [x, y, z] = seen.edges;
+        let sides = x * d.x + y * d.y + z * d.z;
         if !(sides.cmpge(Vec3A::ZERO).all() || sides.cmple(Vec3A::ZERO).all()) {
             return None;
         }
         let sum = sides.x + sides.y + sides.z;
-        let t = self.normal.dot(Vec3A::new(x.x, y.x, z.x)) / self.normal.dot(d);
+        let t = seen.along_normal / seen.normal.dot(d);
         // A ray within the plane divides by zero: t is infinite or NaN, and not in range.
         (t > 0.0 && t < ray.tmax && sum != 0.0).then(|| (t, sides.y / sum, sides.z / sum))
     }
 }
 
-enum Tree {
-    Wide(CwBvh),
-    Narrow(Bvh2),
+/// A triangle as rays from one place see it.
+///
+/// The side of each edge that a ray passes on is computed from the edge's ends alone, the same for
+/// both triangles that share it, up to an exact change of sign: no ray slips through between them.
+/// (Plücker coordinates, as in Embree's robust mode.)
+pub(super) struct Seen {
+    /// Normals of the planes through that place and each edge: x of all three, y, z.
+    edges: [Vec3A; 3],
+    normal: Vec3A,
+    /// How far the triangle's plane is, along `normal`.
+    along_normal: f32,
+}
+
+impl Seen {
+    /// Bits of the directions that pass all edges on the same side, and what tells the sides.
+    #[inline(always)]
+    pub(super) fn sides<L: Lanes>(&self, l: L, directions: [L::F; 3]) -> (u32, [L::F; 3]) {
+        let [x, y, z] = self.edges;
+        let a = l.dot(l.splat3([x.x, y.x, z.x]), directions);
+        let b = l.dot(l.splat3([x.y, y.y, z.y]), directions);
+        let c = l.dot(l.splat3([x.z, y.z, z.z]), directions);
+        let zero = l.splat(0.0);
+        let left = l.and(l.and(l.ge(a, zero), l.ge(b, zero)), l.ge(c, zero));
+        let right = l.and(l.and(l.ge(zero, a), l.ge(zero, b)), l.ge(zero, c));
+        (l.bits(l.or(left, right)), [a, b, c])
+    }
+
+    /// Bits of the directions that meet the triangle's plane within 0 < t < `t_max`.
+    #[inline(always)]
+    pub(super) fn in_range<L: Lanes>(&self, l: L, directions: [L::F; 3], t_max: f32) -> u32 {
+        let normal = l.splat3(self.normal.to_array());
+        let t = l.div(l.splat(self.along_normal), l.dot(normal, directions));
+        l.bits(l.and(l.gt(t, l.splat(0.0)), l.gt(l.splat(t_max), t)))
+    }
 }
 
 /// Triangles under a tree, in one space.
@@ -104,9 +151,19 @@ pub(super) struct Body {
     corners: Vec<Corners>,
     /// What each was in the order given.
     ids: Vec<u32>,
-    tree: Tree,
+    tree: Bvh2,
     /// Of all triangles, a little enlarged; not [`Aabb::valid`] where there are none.
     pub(super) bounds: Aabb,
+    pub(super) core: Option<Core>,
+}
+
+/// A ball that no ray from outside of a larger one gets into without a hit.
+#[derive(Clone, Copy)]
+pub(super) struct Core {
+    pub(super) center: Vec3A,
+    pub(super) radius: f32,
+    /// Of the larger one, which everything is within.
+    pub(super) outer_radius: f32,
 }
 
 /// How far boxes are enlarged, so that rounding in the test of a ray against a box never hides
@@ -127,6 +184,55 @@ fn scatter(x: u32) -> u32 {
     let x = (x ^ (x >> 16)).wrapping_mul(0x7feb_352d);
     let x = (x ^ (x >> 15)).wrapping_mul(0x846c_a68b);
     x ^ (x >> 16)
+}
+
+/// The balls around a place within a closed surface that touch no triangle, and that hold all;
+/// nothing where the surface is open, or the place outside.
+///
+/// Whatever else such a surface does, a ray between the one and outside of the other crosses it.
+fn core(corners: &[Corners], center: Vec3A) -> Option<Core> {
+    let mut edges: HashMap<[[u32; 3]; 2], u32> = HashMap::new();
+    let (mut least, mut farthest) = (f32::INFINITY, 0.0f32);
+    for c in corners {
+        let at = |i: usize| Vec3A::new(c.x[i], c.y[i], c.z[i]);
+        // Plus zero: -0 is the same place.
+        let bits = |i: usize| (at(i) + Vec3A::ZERO).to_array().map(f32::to_bits);
+        let (mut longest, mut nearest) = (0.0f32, f32::INFINITY);
+        for i in 0..3 {
+            let j = (i + 1) % 3;
+            let mut edge = [bits(i), bits(j)];
+            edge.sort_unstable();
+            *edges.entry(edge).or_default() += 1;
+            longest = longest.max(at(i).distance(at(j)));
+            nearest = nearest.min(at(i).distance(center));
+            farthest = farthest.max(at(i).distance(center));
+        }
+        // Its plane is no farther than a triangle; and no place on it is farther from all corners
+        // than the middle of an equilateral one.
+        let plane = c.normal.dot(at(0) - center).abs() / c.normal.length().max(f32::MIN_POSITIVE);
+        least = least.min(plane.max(nearest - longest * 0.578));
+    }
+    let ways = [
+        Vec3A::new(0.31, 0.87, 0.38),
+        Vec3A::new(-0.74, 0.11, 0.66),
+        Vec3A::new(0.52, -0.43, -0.74),
+    ];
+    let is_inside = |way: &Vec3A| {
+        let crossings = corners.iter().filter(|c| {
+            let ray = Ray::new_inf(center, *way);
+            c.hit(&ray).is_some()
+        });
+        crossings.count() % 2 == 1
+    };
+    // A little smaller, for rounding.
+    let radius = least * 0.999;
+    let closed = !corners.is_empty() && edges.values().all(|uses| uses % 2 == 0);
+    let usable = closed && radius > 0.0 && farthest.is_finite();
+    (usable && ways.iter().all(is_inside)).then_some(Core {
+        center,
+        radius,
+        outer_radius: farthest * 1.001,
+    })
 }
 
 /// Builds a binary tree with one box a leaf. Boxes are enlarged a little, each by another amount:
@@ -191,20 +297,6 @@ fn balanced(boxes: &[Aabb]) -> Bvh2 {
     }
 }
 
-fn wide_depth(tree: &CwBvh) -> usize {
-    let mut deepest = 0;
-    let mut stack = vec![(0, 1)];
-    while let Some((node, depth)) = stack.pop() {
-        deepest = deepest.max(depth);
-        let Some(node) = tree.nodes.get(node as usize) else {
-            continue;
-        };
-        let inner = (0..8).filter(|child| node.imask >> child & 1 == 1);
-        stack.extend(inner.map(|child| (node.child_node_index(child), depth + 1)));
-    }
-    deepest
-}
-
 /// Bounds of a box placed by a matrix.
 pub(super) fn placed(bounds: &Aabb, by: &Affine3A) -> Aabb {
     let centre = by.transform_point3a(bounds.center());
@@ -229,30 +321,7 @@ pub(super) fn along(tree: &Bvh2, ray: Ray, mut visit: impl FnMut(&mut Ray, usize
 }
 
 impl Body {
-    /// The fastest to trace.
-    pub(super) fn rigid(corners: &[Corners]) -> Body {
-        let pad = Vec3A::splat(padding(corners));
-        let mut boxes: Vec<Aabb> = corners.iter().map(|c| padded(c.bounds(), pad)).collect();
-        let wide = |tree: &Bvh2| bvh2_to_cwbvh(tree, STATIC.max_prims_per_leaf.min(3), true, false);
-        let mut tree = wide(&tree(&mut boxes, &STATIC));
-        if wide_depth(&tree) > MAX_WIDE_DEPTH {
-            tree = wide(&balanced(&boxes));
-        }
-        let ids = std::mem::take(&mut tree.primitive_indices);
-        Body {
-            corners: ids.iter().map(|id| corners[*id as usize]).collect(),
-            ids,
-            bounds: if corners.is_empty() {
-                Aabb::empty()
-            } else {
-                tree.total_aabb
-            },
-            tree: Tree::Wide(tree),
-        }
-    }
-
-    /// Can be refitted.
-    pub(super) fn deforming(corners: &[Corners]) -> Body {
+    pub(super) fn new(corners: &[Corners]) -> Body {
         let mut boxes: Vec<Aabb> = corners.iter().map(Corners::bounds).collect();
         let mut tree = tree(&mut boxes, &STATIC);
         collapse(
@@ -270,18 +339,24 @@ impl Body {
         let mut body = Body {
             corners: Vec::new(),
             ids,
-            tree: Tree::Narrow(tree),
+            tree,
             bounds: Aabb::empty(),
+            core: None,
         };
         body.refit(corners);
         body
     }
 
-    /// Moves the triangles, given in their original order, of a deforming body.
+    /// Looks for a core. Only bodies that are not refitted keep it.
+    pub(super) fn with_core(mut self) -> Body {
+        self.core = core(&self.corners, self.bounds.center());
+        self
+    }
+
+    /// Moves the triangles, given in their original order.
     pub(super) fn refit(&mut self, corners: &[Corners]) {
-        let Tree::Narrow(tree) = &mut self.tree else {
-            return;
-        };
+        self.core = None;
+        let tree = &mut self.tree;
         let pad = Vec3A::splat(padding(corners));
         self.corners.clear();
         self.corners
@@ -301,41 +376,66 @@ impl Body {
             .map_or(Aabb::empty(), |root| *root.aabb());
     }
 
-    #[inline(always)]
-    fn along(&self, mut ray: Ray, mut visit: impl FnMut(&mut Ray, usize) -> bool) {
-        match &self.tree {
-            Tree::Narrow(tree) => along(tree, ray, visit),
-            Tree::Wide(tree) => {
-                let mut state = tree.new_traversal(ray.direction);
-                let mut node;
-                'done: {
-                    traverse!(
-                        tree,
-                        node,
-                        state,
-                        node.intersect_ray(&ray, state.oct_inv4),
-                        {
-                            if !visit(&mut ray, state.primitive_id as usize) {
-                                break 'done;
-                            }
-                        }
-                    );
-                }
-            }
-        }
-    }
-
     /// Anything that `solid` (given the id and the weights of vertices 1 and 2) does not let
     /// through is in the ray's way.
     #[inline]
     pub(super) fn any(&self, ray: Ray, solid: impl Fn(u32, f32, f32) -> bool) -> bool {
         let mut found = false;
-        self.along(ray, |ray, slot| {
+        along(&self.tree, ray, |ray, slot| {
             let hit = self.corners[slot].hit(ray);
             found = hit.is_some_and(|(_, u, v)| solid(self.ids[slot], u, v));
             !found
         });
         found
+    }
+
+    /// The same for many rays from one origin, together.
+    #[inline(always)]
+    pub(super) fn any_of<L: Lanes>(
+        &self,
+        rays: &mut Rays<'_, L>,
+        solid: impl Fn(u32, f32, f32) -> bool,
+    ) {
+        let nodes = &self.tree.nodes;
+        let Some(root) = nodes.first() else { return };
+        if rays.done() || rays.distance(root.aabb()) == f32::INFINITY {
+            return;
+        }
+        if let Some(core) = &self.core {
+            rays.enter(core);
+        }
+        obvhs::fast_stack!(u32, (96, 192), self.tree.max_depth, stack, {
+            let mut node = root;
+            loop {
+                if node.is_leaf() {
+                    let first = node.first_index as usize;
+                    let slots = first..first + node.prim_count as usize;
+                    let triangles = slots.map(|slot| (&self.corners[slot], self.ids[slot]));
+                    rays.leaf(node.aabb(), triangles, &solid);
+                    if rays.done() {
+                        return;
+                    }
+                } else {
+                    // The nearer one first: what it hides need not be tested again.
+                    let first = node.first_index;
+                    let (left, right) = (&nodes[first as usize], &nodes[first as usize + 1]);
+                    let to_left = rays.distance(left.aabb());
+                    let to_right = rays.distance(right.aabb());
+                    let near = u32::from(to_right < to_left);
+                    if to_left.max(to_right) < f32::INFINITY {
+                        stack.push(first + 1 - near);
+                    }
+                    if to_left.min(to_right) < f32::INFINITY {
+                        node = &nodes[(first + near) as usize];
+                        continue;
+                    }
+                }
+                match stack.pop() {
+                    Some(next) => node = &nodes[next as usize],
+                    None => return,
+                }
+            }
+        });
     }
 
     /// Id, t, and weights of vertices 1 and 2, of the nearest hit that is `solid`.
@@ -345,7 +445,7 @@ impl Body {
         solid: impl Fn(u32, f32, f32) -> bool,
     ) -> Option<(u32, f32, f32, f32)> {
         let mut nearest = None;
-        self.along(ray, |ray, slot| {
+        along(&self.tree, ray, |ray, slot| {
             let id = self.ids[slot];
             if let Some((t, u, v)) = self.corners[slot].hit(ray)
                 && solid(id, u, v)

@@ -7,6 +7,8 @@
 //! the movers' world bounds.
 
 mod body;
+mod fan;
+mod lanes;
 #[cfg(test)]
 mod tests;
 
@@ -18,6 +20,9 @@ use rayon::prelude::*;
 
 use crate::scene::{Mask, Mesh, Pose, Scene, Wrap};
 use body::{Body, Corners};
+use fan::Rays;
+pub use fan::{Directions, Fan};
+use lanes::Lanes;
 
 /// Most triangles in the static group after instancing, so that a small file that places a large
 /// mesh many times can't take all memory (about 0.5 kB a triangle while building).
@@ -80,6 +85,17 @@ pub trait Tracer: Send + Sync {
         against: Against,
         origin: Vec3,
         directions: &[Vec3],
+        t_max: f32,
+        todo: &[u64],
+        hit: &mut [u64],
+    );
+
+    /// As [`Tracer::occluded`] for the rays of a fan, the bits in the sorted order of its
+    /// directions, but much faster: the same rays hit.
+    fn occluded_fan(
+        &self,
+        against: Against,
+        fan: &Fan<'_>,
         t_max: f32,
         todo: &[u64],
         hit: &mut [u64],
@@ -173,6 +189,9 @@ pub struct CpuTracer {
     cutouts: Vec<Option<Cutout>>,
     /// Everything that can be hit, in world space.
     bounds: Aabb,
+    /// The processor has it.
+    #[cfg(target_arch = "x86_64")]
+    avx: Option<pulp::x86::V3>,
 }
 
 struct Mover {
@@ -182,6 +201,8 @@ struct Mover {
     own: Option<Body>,
     /// World directions to local ones; nothing if it can't be hit.
     local_from_world: Option<Mat3A>,
+    /// World directions from local ones.
+    world_from_local: Mat3A,
     translation: Vec3A,
     /// World bounds.
     bounds: Aabb,
@@ -324,8 +345,9 @@ impl CpuTracer {
                     mesh: instance.mesh,
                     own: instance
                         .deforms
-                        .then(|| Body::deforming(&corners_of(mesh, positions))),
+                        .then(|| Body::new(&corners_of(mesh, positions))),
                     local_from_world: None,
+                    world_from_local: Mat3A::IDENTITY,
                     translation: Vec3A::ZERO,
                     bounds: Aabb::empty(),
                 });
@@ -340,14 +362,21 @@ impl CpuTracer {
             }
         }
         let rigid = |(mesh, placed): (&Mesh, &bool)| {
-            if *placed {
-                Body::rigid(&corners_of(mesh, &mesh.positions))
+            let corners = if *placed {
+                corners_of(mesh, &mesh.positions)
             } else {
-                Body::rigid(&[])
+                Vec::new()
+            };
+            let body = Body::new(&corners);
+            // Through holes, rays get anywhere.
+            if mesh.mask.is_some() {
+                body
+            } else {
+                body.with_core()
             }
         };
         let mut tracer = CpuTracer {
-            fixed: Body::rigid(&corners),
+            fixed: Body::new(&corners),
             fixed_instances,
             fixed_masked,
             meshes: scene.meshes.par_iter().zip(&placed).map(rigid).collect(),
@@ -357,6 +386,8 @@ impl CpuTracer {
             mesh_of,
             cutouts: scene.meshes.iter().map(Cutout::new).collect(),
             bounds: Aabb::empty(),
+            #[cfg(target_arch = "x86_64")]
+            avx: pulp::x86::V3::try_new(),
         };
         tracer.update(scene, pose, deformed);
         Ok(tracer)
@@ -406,28 +437,56 @@ impl CpuTracer {
         }
     }
 
-    fn occluded_by_fixed(
+    /// A triangle of `fixed` belongs to the group, and is no hole there.
+    fn solid(&self, against: Against, id: u32, u: f32, v: f32) -> bool {
+        let (instance, triangle) = self.fixed_source(id);
+        let belongs = match against {
+            Against::Instance(only) => instance == only,
+            Against::AllExcept(but) => instance != but,
+            Against::All | Against::Static | Against::Movers => true,
+        };
+        belongs && !self.hole_at(self.mesh_of[instance as usize], triangle, u, v)
+    }
+
+    /// Calls `ask` with each body of the group that is within reach: nothing stands for `fixed`,
+    /// and the flag says whether all of its triangles count.
+    fn each_body(
         &self,
-        keep: impl Fn(u32) -> bool,
-        all: bool,
+        against: Against,
         origin: Vec3A,
-        directions: &[Vec3],
-        span: &Span,
-        todo: &[u64],
-        hit: &mut [u64],
+        t_max: f32,
+        mut ask: impl FnMut(Option<&Mover>, bool),
     ) {
-        let plain = all && !self.fixed_masked;
-        for_each_open(todo, hit, directions.len(), |i| {
-            ray(origin, Vec3A::from(directions[i]) * span.unit, span.end).is_some_and(|ray| {
-                self.fixed.any(ray, |id, u, v| {
-                    plain || {
-                        let (instance, triangle) = self.fixed_source(id);
-                        let mesh = self.mesh_of[instance as usize];
-                        keep(instance) && !self.hole_at(mesh, triangle, u, v)
-                    }
-                })
-            })
-        });
+        let named = match against {
+            Against::Instance(i) | Against::AllExcept(i) => Some(i),
+            Against::All | Against::Static | Against::Movers => None,
+        };
+        // An instance that is not a mover is part of the static tree, and filtered there.
+        let mover = named.and_then(|i| self.mover_of.get(i as usize).copied().flatten());
+        let only_instance = matches!(against, Against::Instance(_));
+        if against != Against::Movers && !(only_instance && mover.is_some()) {
+            ask(
+                None,
+                (named.is_none() || mover.is_some()) && !self.fixed_masked,
+            );
+        }
+        if only_instance {
+            if let Some(mover) = mover {
+                ask(Some(&self.movers[mover as usize]), true);
+            }
+        } else if against != Against::Static {
+            let around = Aabb::new(origin - t_max, origin + t_max);
+            self.top.aabb_traverse(around, |top, leaf| {
+                let slot = top.nodes[leaf as usize].first_index;
+                let mover = &self.movers[top.primitive_indices[slot as usize] as usize];
+                let nearest = origin.clamp(mover.bounds.min, mover.bounds.max);
+                let near = nearest.distance_squared(origin) <= t_max * t_max;
+                if near && against != Against::AllExcept(mover.instance) {
+                    ask(Some(mover), true);
+                }
+                true
+            });
+        }
     }
 
     fn occluded_by_mover(
@@ -469,6 +528,50 @@ fn corners_of(mesh: &Mesh, positions: &[Vec3]) -> Vec<Corners> {
         .collect()
 }
 
+struct Bundled<'a> {
+    fan: &'a Fan<'a>,
+    bundle: &'a fan::Bundle,
+    placed: Option<(Mat3A, Mat3A, Vec3A)>,
+    body: &'a Body,
+    t_max: f32,
+    todo: &'a [u64],
+    hit: &'a mut [u64],
+}
+struct Solid<'a, F>(Bundled<'a>, F);
+
+impl<F: Fn(u32, f32, f32) -> bool> Solid<'_, F> {
+    #[inline(always)]
+    fn run<L: Lanes>(self, lanes: L) {
+        let Solid(b, solid) = self;
+        let mut rays = Rays::new(lanes, b.fan, b.bundle, b.placed, b.t_max, b.todo, b.hit);
+        b.body.any_of(&mut rays, solid);
+        rays.gather(b.todo, b.hit);
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+struct WithAvx<'a, F>(Solid<'a, F>, pulp::x86::V3);
+
+#[cfg(target_arch = "x86_64")]
+impl<F: Fn(u32, f32, f32) -> bool> pulp::NullaryFnOnce for WithAvx<'_, F> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        self.0.run(self.1);
+    }
+}
+
+impl CpuTracer {
+    fn dispatch<F: Fn(u32, f32, f32) -> bool>(&self, solid: Solid<'_, F>) {
+        #[cfg(target_arch = "x86_64")]
+        if let Some(avx) = self.avx {
+            return avx.vectorize(WithAvx(solid, avx));
+        }
+        solid.run(lanes::Plain)
+    }
+}
+
 impl Tracer for CpuTracer {
     fn occluded(
         &self,
@@ -483,39 +586,67 @@ impl Tracer for CpuTracer {
         let Some(span) = self.span(origin, t_max) else {
             return;
         };
-        let keep = |instance: u32| match against {
-            Against::Instance(only) => instance == only,
-            Against::AllExcept(but) => instance != but,
-            Against::All | Against::Static | Against::Movers => true,
+        self.each_body(against, origin, t_max, |mover, plain| match mover {
+            Some(mover) => self.occluded_by_mover(mover, origin, directions, &span, todo, hit),
+            None => for_each_open(todo, hit, directions.len(), |i| {
+                ray(origin, Vec3A::from(directions[i]) * span.unit, span.end).is_some_and(|ray| {
+                    self.fixed
+                        .any(ray, |id, u, v| plain || self.solid(against, id, u, v))
+                })
+            }),
+        });
+    }
+
+    fn occluded_fan(
+        &self,
+        against: Against,
+        fan: &Fan<'_>,
+        t_max: f32,
+        todo: &[u64],
+        hit: &mut [u64],
+    ) {
+        let Some(span) = self.span(fan.origin.into(), t_max) else {
+            return;
         };
-        let named = match against {
-            Against::Instance(i) | Against::AllExcept(i) => Some(i),
-            Against::All | Against::Static | Against::Movers => None,
-        };
-        // An instance that is not a mover is part of the static tree, and filtered there.
-        let mover = named.and_then(|i| self.mover_of.get(i as usize).copied().flatten());
-        let only_instance = matches!(against, Against::Instance(_));
-        if against != Against::Movers && !(only_instance && mover.is_some()) {
-            let all = named.is_none() || mover.is_some();
-            self.occluded_by_fixed(keep, all, origin, directions, &span, todo, hit);
-        }
-        if only_instance {
-            if let Some(mover) = mover {
-                let mover = &self.movers[mover as usize];
-                self.occluded_by_mover(mover, origin, directions, &span, todo, hit);
-            }
-        } else if against != Against::Static {
-            let around = Aabb::new(origin - t_max, origin + t_max);
-            self.top.aabb_traverse(around, |top, leaf| {
-                let slot = top.nodes[leaf as usize].first_index;
-                let mover = &self.movers[top.primitive_indices[slot as usize] as usize];
-                let nearest = origin.clamp(mover.bounds.min, mover.bounds.max);
-                if keep(mover.instance) && nearest.distance_squared(origin) <= t_max * t_max {
-                    self.occluded_by_mover(mover, origin, directions, &span, todo, hit);
+        let t_max = span.end * span.unit;
+        self.each_body(against, fan.origin.into(), t_max, |mover, plain| {
+            let (body, placed) = match mover {
+                None => (&self.fixed, None),
+                Some(mover) => match mover.local_from_world {
+                    Some(m) => (
+                        self.body(mover),
+                        Some((m, mover.world_from_local, mover.translation)),
+                    ),
+                    None => return,
+                },
+            };
+            for (bundle, words) in fan.bundles() {
+                let (todo, hit) = (&todo[words.clone()], &mut hit[words]);
+                let trace = Bundled {
+                    fan,
+                    bundle,
+                    placed,
+                    body,
+                    t_max,
+                    todo,
+                    hit,
+                };
+                match mover {
+                    None if plain => self.dispatch(Solid(trace, |_, _, _| true)),
+                    None => {
+                        let solid = |id, u, v| self.solid(against, id, u, v);
+                        self.dispatch(Solid(trace, solid));
+                    }
+                    Some(mover) if self.cutouts[mover.mesh as usize].is_none() => {
+                        self.dispatch(Solid(trace, |_, _, _| true));
+                    }
+                    Some(mover) => {
+                        let solid = |id, u, v| !self.hole_at(mover.mesh, id, u, v);
+                        self.dispatch(Solid(trace, solid));
+                    }
                 }
-                true
-            });
-        }
+            }
+        });
     }
 
     fn closest(&self, origin: Vec3, direction: Vec3, t_max: f32) -> Option<Hit> {
@@ -575,6 +706,7 @@ impl Tracer for CpuTracer {
             let place = &pose.instances[mover.instance as usize].world_from_local;
             let body = mover.own.as_ref().unwrap_or(&meshes[mover.mesh as usize]);
             mover.local_from_world = inverse(place).filter(|_| body.bounds.valid());
+            mover.world_from_local = place.matrix3;
             mover.translation = place.translation;
             mover.bounds = body::placed(&body.bounds, place);
             if !(mover.bounds.min.is_finite() && mover.bounds.max.is_finite()) {
