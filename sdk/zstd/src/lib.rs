@@ -16,6 +16,9 @@ use zstd_sys::{
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct NotOneFrame;
 
+/// How a frame begins that has content; others are to be skipped.
+const MAGIC: [u8; 4] = 0xFD2F_B528u32.to_le_bytes();
+
 /// Words of memory that [`decompress`] needs, about 12 000.
 pub fn state_words() -> usize {
     // SAFETY: it takes nothing, and returns a constant of the library.
@@ -36,7 +39,7 @@ pub fn decompress(state: &mut [u64], output: &mut [u8], input: &[u8]) -> Result<
     // SAFETY: the pointer and the length are those of `input`.
     let length = unsafe { ZSTD_findFrameCompressedSize(input.as_ptr().cast(), input.len()) };
     // An error code is a length beyond any slice's. zstd itself would go on behind the first frame.
-    if length != input.len() {
+    if length != input.len() || !input.starts_with(&MAGIC) {
         return Err(NotOneFrame);
     }
     // SAFETY: `state` is `size_of_val` bytes aligned to 8 that nothing else uses during this call;
