@@ -1,6 +1,6 @@
 //! The client's side of a stream: packets in, frames out.
 
-use crate::memory::{Heap, SliceHeap};
+use crate::memory::{Heap, Limits, Piece, SliceHeap, Source};
 use psao_core::Mirror;
 use psao_core::mirror::Capacity;
 use psao_core::slices::{apply_instances, apply_patches, apply_slices};
@@ -25,6 +25,8 @@ pub enum ClientError {
     Stream(StreamError),
     /// The scene needs more room than [`Config::capacity`] (what it needs).
     Capacity(Capacity),
+    /// The stream needs more memory than was lent (what it needs).
+    Limits(Limits),
     /// The stream is of another scene (its hash).
     Scene(u64),
     /// A frame's content is not one zstd frame of the size that it says.
@@ -56,6 +58,11 @@ impl std::fmt::Display for ClientError {
                 needed.points,
                 needed.patches,
                 needed.topology_bytes
+            ),
+            ClientError::Limits(needed) => write!(
+                f,
+                "the stream needs packets of {} bytes and contents of {}: lend more memory",
+                needed.body_bytes, needed.raw_bytes
             ),
             ClientError::Scene(hash) => write!(
                 f,
@@ -118,53 +125,111 @@ pub struct Stats {
     pub patches: u64,
 }
 
-/// Follows one stream. Memory is taken when the header comes, and never after.
+/// Largest packet body before the header says what this stream's is.
+const FIRST_BODY_BYTES: u32 = 4096;
+
+/// Follows one stream. From the heap, memory is taken at construction and when the header comes;
+/// a client in lent memory takes none at all.
+#[derive(Debug)]
 pub struct Client {
-    config: Config,
+    gather: Gather,
+    decoder: Decoder,
+}
+
+/// Bytes of a packet that is not whole yet.
+#[derive(Debug)]
+struct Gather {
+    bytes: Piece<u8>,
+    length: usize,
+    preamble_done: bool,
+}
+
+/// Everything behind a whole packet.
+#[derive(Debug)]
+struct Decoder {
+    limits: Limits,
+    scene_hash: u64,
     state: State,
     header: Option<Header>,
     mirror: Mirror<Heap>,
     slices: SliceHeap,
-    /// What mirror and slices have room for.
+    /// What mirror and slices have their present lengths for.
     room: Capacity,
     /// Of the patches that have come.
     topology_hash: u64,
-    /// Bytes of a packet that is not whole yet.
-    input: Vec<u8>,
     /// Decompressed content of a packet.
-    raw: Vec<u8>,
-    zstd: zstd::zstd_safe::DCtx<'static>,
+    raw: Piece<u8>,
+    zstd: Piece<u64>,
     next_sequence: u32,
     /// Number of the last frame that a packet came of.
     last_frame: Option<u32>,
     /// Number and time of the frame that is not complete.
     open_frame: Option<(u32, u64)>,
-    preamble_done: bool,
     /// The frame being received began with a reset of the mirror.
     in_snapshot: bool,
+    /// The mirror holds a part of a frame, or not what the server has.
+    partial: bool,
     stats: Stats,
 }
 
 impl Client {
-    /// A client that has received nothing.
+    /// A client that has received nothing, with memory from the heap.
     pub fn new(config: Config) -> Client {
-        Client {
-            config,
-            state: State::Connecting,
-            header: None,
-            mirror: Mirror::new(Heap::new(Capacity::default())),
-            slices: SliceHeap::default(),
-            room: Capacity::default(),
-            topology_hash: 0,
-            input: Vec::new(),
-            raw: Vec::new(),
-            zstd: zstd::zstd_safe::DCtx::create(),
-            next_sequence: 0,
-            last_frame: None,
-            open_frame: None,
-            preamble_done: false,
-            in_snapshot: false,
-            stats: Stats::default(),
+        let limits = Limits::of_any(config.capacity);
+        Client::from(&mut Source::Heap, limits, config.scene_hash)
+    }
+
+    /// A client that takes no memory, ever: all that it needs comes from `source`, usually
+    /// [`Source::Lent`]. Measure the block first, by making one from [`Source::Measure`].
+    ///
+    /// `scene_hash`: as in [`Config::scene_hash`].
+    ///
+    /// # Panics
+    /// If the block is shorter than measured.
+    pub fn from(source: &mut Source, limits: Limits, scene_hash: u64) -> Client {
+        let first_body_bytes = limits.body_bytes.max(FIRST_BODY_BYTES);
+        let mut client = Client {
+            gather: Gather {
+                bytes: source.piece(packet_bytes(first_body_bytes) as u64),
+                length: 0,
+                preamble_done: false,
+            },
+            decoder: Decoder {
+                limits,
+                scene_hash,
+                state: State::Connecting,
+                header: None,
+                mirror: Mirror::new(Heap::from(source, limits.capacity)),
+                slices: SliceHeap::from(source, limits.capacity),
+                room: Capacity::default(),
+                topology_hash: 0,
+                raw: source.piece(u64::from(limits.raw_bytes)),
+                zstd: source.piece(psao_zstd::state_words() as u64),
+                next_sequence: 0,
+                last_frame: None,
+                open_frame: None,
+                in_snapshot: false,
+                partial: false,
+                stats: Stats::default(),
+            },
+        };
+        if !matches!(source, Source::Measure(_)) {
+            client
+                .gather
+                .bytes
+                .resize_zeroed(packet_bytes(FIRST_BODY_BYTES));
+            client.decoder.zstd.resize_zeroed(psao_zstd::state_words());
+        }
+        client
+    }
+
+    /// Lines of a block that is enough for a client with these limits; `u64::MAX` if no block is.
+    pub fn lines(limits: Limits) -> u64 {
+        let mut source = Source::Measure(0);
+        Client::from(&mut source, limits, 0);
+        match source {
+            Source::Measure(lines) => lines,
+            Source::Heap | Source::Lent(_) => 0,
         }
     }
 
@@ -172,14 +237,15 @@ impl Client {
     /// picture freezes rather than flashes) until the new stream's first snapshot, or until its
     /// header if the scene needs another capacity.
     pub fn restart(&mut self) {
-        self.state = State::Connecting;
-        self.header = None;
-        self.input.clear();
-        self.next_sequence = 0;
-        self.last_frame = None;
-        self.open_frame = None;
-        self.preamble_done = false;
-        self.in_snapshot = false;
+        self.gather.length = 0;
+        self.gather.preamble_done = false;
+        let decoder = &mut self.decoder;
+        decoder.state = State::Connecting;
+        decoder.header = None;
+        decoder.next_sequence = 0;
+        decoder.last_frame = None;
+        decoder.open_frame = None;
+        decoder.in_snapshot = false;
     }
 
     /// Feeds stream bytes, in any portions. Stops behind a completed frame, so that the caller
@@ -189,46 +255,49 @@ impl Client {
     /// The bytes are not the stream of this scene; the client is then [`State::Failed`] until
     /// [`Client::restart`].
     pub fn push(&mut self, bytes: &[u8]) -> Result<Pushed, ClientError> {
-        if self.state == State::Failed {
+        if self.decoder.state == State::Failed {
             return Err(ClientError::Failed);
         }
         let result = self.push_bytes(bytes);
         match &result {
-            Ok(pushed) => self.stats.bytes += pushed.consumed as u64,
-            Err(_) => self.state = State::Failed,
+            Ok(pushed) => self.decoder.stats.bytes += pushed.consumed as u64,
+            Err(_) => self.decoder.state = State::Failed,
         }
         result
     }
 
     fn push_bytes(&mut self, bytes: &[u8]) -> Result<Pushed, ClientError> {
+        let Client { gather, decoder } = self;
         let mut rest = bytes;
         while !rest.is_empty() {
-            if self.state == State::Ended {
+            if decoder.state == State::Ended {
                 return Err(StreamError::Order.into());
             }
-            let wanted = self.wanted_bytes()?;
-            if self.input.is_empty() && rest.len() >= wanted && self.preamble_done {
-                // The common case: read the packet where it lies.
-                if let Some((packet, length)) = Packet::read(rest, self.max_body_bytes())? {
-                    rest = &rest[length..];
-                    if let Some(frame) = self.packet(packet)? {
-                        let consumed = bytes.len() - rest.len();
-                        return Ok(Pushed {
-                            consumed,
-                            frame: Some(frame),
-                        });
-                    }
-                    continue;
-                }
+            let max_body_bytes = decoder.max_body_bytes();
+            let frame = if gather.length == 0
+                && gather.preamble_done
+                && let Some((packet, length)) = Packet::read(rest, max_body_bytes)?
+            {
+                // The common case: the packet is read where it lies.
+                rest = &rest[length..];
+                decoder.packet(packet)?
+            } else {
+                let missing = gather.wanted_bytes(max_body_bytes)? - gather.length;
+                let (head, tail) = rest.split_at(missing.min(rest.len()));
+                gather.bytes[gather.length..][..head.len()].copy_from_slice(head);
+                gather.length += head.len();
+                rest = tail;
+                gather.take(decoder)?
+            };
+            // The header just said how large a packet may be; nothing is gathered at this point.
+            let packet_bytes = packet_bytes(decoder.max_body_bytes());
+            if gather.bytes.len() < packet_bytes {
+                gather.bytes.resize_zeroed(packet_bytes);
             }
-            let missing = wanted.saturating_sub(self.input.len()).max(1);
-            let (head, tail) = rest.split_at(missing.min(rest.len()));
-            self.input.extend_from_slice(head);
-            rest = tail;
-            if let Some(frame) = self.gathered()? {
+            if frame.is_some() {
                 return Ok(Pushed {
                     consumed: bytes.len() - rest.len(),
-                    frame: Some(frame),
+                    frame,
                 });
             }
         }
@@ -238,58 +307,113 @@ impl Client {
         })
     }
 
-    /// Bytes that `input` must hold before the next step can be taken.
-    fn wanted_bytes(&self) -> Result<usize, ClientError> {
+    /// Where the client is in its stream.
+    pub fn state(&self) -> State {
+        self.decoder.state
+    }
+
+    /// The stream's parameters, once its header has come.
+    pub fn header(&self) -> Option<&Header> {
+        self.decoder.header.as_ref()
+    }
+
+    /// The state of the last completed frame (and, between pushes that complete none, of a part
+    /// of the next: see [`Client::is_whole`]).
+    pub fn mirror(&self) -> &Mirror<Heap> {
+        &self.decoder.mirror
+    }
+
+    /// The mirror is that of a complete frame: it may be shown, and uploaded.
+    pub fn is_whole(&self) -> bool {
+        self.decoder.stats.frames > 0 && !self.decoder.partial
+    }
+
+    /// What profile `residual` keeps beside the mirror.
+    pub fn slices(&self) -> &SliceHeap {
+        &self.decoder.slices
+    }
+
+    /// What to say in a hello ([`psao_core::uplink::Hello::topology_hash`]) so that no patch is
+    /// sent again: the hash of the patches that this client has got, in an earlier stream or from
+    /// a recording, if it has all of them; else 0.
+    pub fn topology_hash(&self) -> u64 {
+        if self.decoder.slices.has_all_patches() {
+            self.decoder.topology_hash
+        } else {
+            0
+        }
+    }
+
+    /// What changed has been uploaded.
+    pub fn clear_dirty(&mut self) {
+        self.decoder.mirror.clear_dirty();
+    }
+
+    /// Totals.
+    pub fn stats(&self) -> Stats {
+        self.decoder.stats
+    }
+
+    /// Bytes of memory held: buffers, dirty sets, and the input and decompression buffers.
+    pub fn memory_bytes(&self) -> u64 {
+        let Client { gather, decoder } = self;
+        decoder.mirror.capacity().bytes()
+            + decoder.slices.bytes()
+            + gather.bytes.bytes()
+            + decoder.raw.bytes()
+            + decoder.zstd.bytes()
+    }
+}
+
+/// Bytes of the longest packet.
+fn packet_bytes(max_body_bytes: u32) -> usize {
+    PACKET_HEADER_BYTES + max_body_bytes as usize
+}
+
+impl Gather {
+    /// Bytes that there must be before the next step can be taken; more than there are.
+    fn wanted_bytes(&self, max_body_bytes: u32) -> Result<usize, ClientError> {
         if !self.preamble_done {
             return Ok(PREAMBLE.len());
         }
-        if self.input.len() < PACKET_HEADER_BYTES {
+        if self.length < PACKET_HEADER_BYTES {
             return Ok(PACKET_HEADER_BYTES);
         }
-        let mut length = Reader(&self.input[4..]);
+        let mut length = Reader(&self.bytes[4..]);
         let body_bytes = length.u32()?;
-        if body_bytes > self.max_body_bytes() {
+        if body_bytes > max_body_bytes {
             return Err(StreamError::PacketTooLarge(body_bytes).into());
         }
         Ok(PACKET_HEADER_BYTES + body_bytes as usize)
     }
 
-    fn max_body_bytes(&self) -> u32 {
-        self.header.map_or(4096, |header| header.max_body_bytes)
-    }
-
-    /// Takes what `input` holds if it is whole.
-    fn gathered(&mut self) -> Result<Option<Frame>, ClientError> {
+    /// Hands on what there is if it is whole.
+    fn take(&mut self, decoder: &mut Decoder) -> Result<Option<Frame>, ClientError> {
+        let gathered = &self.bytes[..self.length];
         if !self.preamble_done {
-            if !PREAMBLE.starts_with(&self.input[..self.input.len().min(PREAMBLE.len())]) {
+            if !PREAMBLE.starts_with(gathered) {
                 return Err(StreamError::NotAStream.into());
             }
-            if self.input.len() == PREAMBLE.len() {
+            if gathered.len() == PREAMBLE.len() {
                 self.preamble_done = true;
-                self.input.clear();
+                self.length = 0;
             }
             return Ok(None);
         }
-        if self.input.len() < self.wanted_bytes()? {
-            return Ok(None);
+        match Packet::read(gathered, decoder.max_body_bytes())? {
+            Some((packet, _)) => {
+                self.length = 0;
+                decoder.packet(packet)
+            }
+            None => Ok(None),
         }
-        // The buffer moves out for the time of the call and comes back emptied.
-        let mut input = std::mem::take(&mut self.input);
-        let result = match Packet::read(&input, self.max_body_bytes()) {
-            Ok(Some((packet, _))) => self.packet(packet),
-            Ok(None) => Ok(None),
-            Err(error) => Err(error.into()),
-        };
-        input.clear();
-        self.input = input;
-        if self.header.is_some() && self.input.capacity() < self.packet_bytes() {
-            self.input.reserve_exact(self.packet_bytes());
-        }
-        result
     }
+}
 
-    fn packet_bytes(&self) -> usize {
-        PACKET_HEADER_BYTES + self.max_body_bytes() as usize
+impl Decoder {
+    fn max_body_bytes(&self) -> u32 {
+        self.header
+            .map_or(FIRST_BODY_BYTES, |header| header.max_body_bytes)
     }
 
     fn packet(&mut self, packet: Packet<'_>) -> Result<Option<Frame>, ClientError> {
@@ -335,30 +459,33 @@ impl Client {
     }
 
     fn begin(&mut self, header: Header) -> Result<(), ClientError> {
-        let need = header.capacity;
-        if !self.config.capacity.holds(&need) {
-            return Err(ClientError::Capacity(need));
+        let need = Limits::of(&header);
+        if !self.limits.capacity.holds(&need.capacity) {
+            return Err(ClientError::Capacity(need.capacity));
         }
-        if self.config.scene_hash != 0 && self.config.scene_hash != header.scene_hash {
+        if !need.fit(&self.limits) {
+            return Err(ClientError::Limits(need));
+        }
+        if self.scene_hash != 0 && self.scene_hash != header.scene_hash {
             return Err(ClientError::Scene(header.scene_hash));
         }
-        // What is replaced goes first, so that old and new are never held at once.
-        if self.room != need {
-            self.mirror = Mirror::new(Heap::new(Capacity::default()));
-            self.slices = SliceHeap::default();
-            self.mirror = Mirror::new(Heap::new(need));
-            self.slices = SliceHeap::new(need);
-            self.room = need;
+        if self.room != need.capacity {
+            let empty = Mirror::new(Heap::default());
+            let mut memory = std::mem::replace(&mut self.mirror, empty).into_memory();
+            memory.resize_changed(need.capacity);
+            self.mirror = Mirror::new(memory);
+            self.slices.resize(need.capacity);
+            self.room = need.capacity;
         } else {
-            self.slices.slices().reset(need.cells);
+            self.slices.slices().reset(need.capacity.cells);
             if header.topology_hash == 0 || header.topology_hash != self.topology_hash {
                 self.slices.slices().forget_patches();
             }
         }
         self.topology_hash = header.topology_hash;
-        self.raw.resize(header.max_raw_bytes as usize, 0);
+        self.raw.resize_zeroed(need.raw_bytes as usize);
         self.header = Some(header);
-        self.input.reserve_exact(self.packet_bytes());
+        self.partial = true;
         // Frames count only from a snapshot on: what an earlier connection left is not the
         // server's starting point.
         self.state = State::Desynchronised;
@@ -390,6 +517,7 @@ impl Client {
         } else if self.state == State::Desynchronised && !self.in_snapshot {
             return Ok(None);
         }
+        self.partial = true;
         let raw_bytes = frame.raw_bytes as usize;
         if packet.kind == kind::SLICES {
             if raw_bytes != compressed.len() {
@@ -399,18 +527,9 @@ impl Client {
             let count = apply_slices(compressed, header.step, &mut self.mirror, slices)?;
             self.stats.slices += u64::from(count);
         } else if raw_bytes > 0 {
-            // zstd itself would go on behind the first frame, and skip what is none.
-            if zstd::zstd_safe::find_frame_compressed_size(compressed) != Ok(compressed.len()) {
-                return Err(ClientError::Compression);
-            }
             let room = &mut self.raw[..raw_bytes];
-            let written = self
-                .zstd
-                .decompress(room, compressed)
+            psao_zstd::decompress(&mut self.zstd, room, compressed)
                 .map_err(|_| ClientError::Compression)?;
-            if written != raw_bytes {
-                return Err(ClientError::Compression);
-            }
             let raw = &self.raw[..raw_bytes];
             let changes = match header.profile {
                 Profile::Cells => apply_changes(raw, &mut self.mirror)?,
@@ -437,59 +556,9 @@ impl Client {
         self.stats.frames += 1;
         self.stats.snapshots += u64::from(self.in_snapshot);
         self.in_snapshot = false;
+        self.partial = false;
         self.state = State::Live;
         Ok(Some(frame))
-    }
-
-    /// Where the client is in its stream.
-    pub fn state(&self) -> State {
-        self.state
-    }
-
-    /// The stream's parameters, once its header has come.
-    pub fn header(&self) -> Option<&Header> {
-        self.header.as_ref()
-    }
-
-    /// The state of the last completed frame (and, between pushes that complete none, of a part
-    /// of the next).
-    pub fn mirror(&self) -> &Mirror<Heap> {
-        &self.mirror
-    }
-
-    /// What profile `residual` keeps beside the mirror.
-    pub fn slices(&self) -> &SliceHeap {
-        &self.slices
-    }
-
-    /// What to say in a hello ([`psao_core::uplink::Hello::topology_hash`]) so that no patch is
-    /// sent again: the hash of the patches that this client has got, in an earlier stream or from
-    /// a recording, if it has all of them; else 0.
-    pub fn topology_hash(&self) -> u64 {
-        if self.slices.has_all_patches() {
-            self.topology_hash
-        } else {
-            0
-        }
-    }
-
-    /// What changed has been uploaded.
-    pub fn clear_dirty(&mut self) {
-        self.mirror.clear_dirty();
-    }
-
-    /// Totals.
-    pub fn stats(&self) -> Stats {
-        self.stats
-    }
-
-    /// Bytes of memory held: buffers, dirty sets, and the input and decompression buffers.
-    pub fn memory_bytes(&self) -> u64 {
-        self.mirror.capacity().bytes()
-            + self.slices.bytes()
-            + self.input.capacity() as u64
-            + self.raw.capacity() as u64
-            + self.zstd.sizeof() as u64
     }
 }
 

@@ -172,6 +172,11 @@ impl<M: Memory> Mirror<M> {
         mirror
     }
 
+    /// The memory back, with what is in it.
+    pub fn into_memory(self) -> M {
+        self.memory
+    }
+
     /// How many of each it has room for.
     pub fn capacity(&self) -> Capacity {
         let parts = self.memory.parts();
