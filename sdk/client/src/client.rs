@@ -342,18 +342,23 @@ impl Client {
         if self.config.scene_hash != 0 && self.config.scene_hash != header.scene_hash {
             return Err(ClientError::Scene(header.scene_hash));
         }
+        // A server that was told that this client has all patches does not send them again,
+        // whatever else its header asks for.
+        let same_topology = header.topology_hash != 0
+            && header.topology_hash == self.topology_hash
+            && need.patches == self.room.patches
+            && need.topology_bytes == self.room.topology_bytes;
+        if !same_topology {
+            self.slices.slices().forget_patches();
+        }
         // What is replaced goes first, so that old and new are never held at once.
         if self.room != need {
             self.mirror = Mirror::new(Heap::new(Capacity::default()));
-            self.slices = SliceHeap::default();
+            self.slices = std::mem::take(&mut self.slices).resized(need);
             self.mirror = Mirror::new(Heap::new(need));
-            self.slices = SliceHeap::new(need);
             self.room = need;
         } else {
             self.slices.slices().reset(need.cells);
-            if header.topology_hash == 0 || header.topology_hash != self.topology_hash {
-                self.slices.slices().forget_patches();
-            }
         }
         self.topology_hash = header.topology_hash;
         self.raw.resize(header.max_raw_bytes as usize, 0);

@@ -97,6 +97,30 @@ impl SliceHeap {
         heap
     }
 
+    /// Room as another header asks for: no slice is open. Where the room for patches is the same,
+    /// those that have come stay. What goes is given back before anything new is taken.
+    pub fn resized(mut self, capacity: Capacity) -> SliceHeap {
+        let lengths = (self.patches.len(), self.topology.len());
+        if lengths != (capacity.patches as usize, capacity.topology_bytes as usize) {
+            drop(self);
+            return SliceHeap::new(capacity);
+        }
+        let patches = std::mem::take(&mut self.patches);
+        let topology = std::mem::take(&mut self.topology);
+        let topology_used = self.topology_used;
+        drop(self);
+        SliceHeap {
+            patches,
+            topology,
+            topology_used,
+            ..SliceHeap::new(Capacity {
+                patches: 0,
+                topology_bytes: 0,
+                ..capacity
+            })
+        }
+    }
+
     /// Lends it to the codec.
     pub fn slices(&mut self) -> Slices<'_> {
         let SliceHeap {
