@@ -70,7 +70,7 @@ impl Served {
         let server = Server::new(world(scene, density), settings);
         let identity = Identity::ephemeral().unwrap();
         let fingerprint = identity.fingerprint();
-        let capacity = capacity_of(&server.world.truth);
+        let capacity = capacity_of(&server.world);
         let transport = Transport::start(TransportConfig {
             listen: "127.0.0.1:0".parse().unwrap(),
             identity,
@@ -104,6 +104,7 @@ impl Served {
             trust: Trust::Fingerprint(self.fingerprint),
             scene_hash: self.server.scene_hash(),
             capacity: self.capacity,
+            topology_hash: 0,
         };
         change(&mut connect);
         Connection::open(connect).unwrap()
@@ -219,8 +220,7 @@ impl Link {
 
     /// How far off the points in view are, in 1/255, as a root mean square.
     fn rmse(&self, served: &Served) -> f64 {
-        let mirror = self.client.mirror();
-        served.server.point_rmse(self.id, mirror).unwrap()
+        served.server.point_rmse(self.id, &self.client).unwrap()
     }
 }
 
@@ -240,6 +240,7 @@ fn camera(forward: [f32; 3]) -> Camera {
         up: [0.0, 1.0, 0.0],
         fov_y_rad: 1.0,
         aspect: 1.0,
+        height_px: 0,
     }
 }
 

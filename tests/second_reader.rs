@@ -1,7 +1,8 @@
 //! A second reader of streams, written from `docs/format.md` alone: slow, obvious, and sharing no
 //! code with the SDK. What both say of the same bytes must be the same.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
+use std::ops::Range;
 use std::sync::LazyLock;
 
 /// One of the mirror's buffers: elements that were set, and their index.
@@ -15,6 +16,9 @@ pub struct Shown {
     pub mirror_hash: u64,
     /// Instances, buckets, cells; without elements that are all zero (8.2: they do not count).
     pub mirror: [Buffer; 3],
+    /// Of each open slice: the number of its first point, and the occlusion of all its points,
+    /// in cells or not.
+    pub slices: BTreeMap<u32, (u32, Vec<u8>)>,
 }
 
 /// All that a stream says.
@@ -28,6 +32,25 @@ pub struct Read {
     pub error: Option<String>,
 }
 
+/// What a reader has room for (4.3).
+#[derive(Clone, Copy, Debug)]
+pub struct Room {
+    /// Instances, buckets, cells.
+    pub lengths: [u32; 3],
+    pub slices: u32,
+    pub points: u32,
+    pub patches: u32,
+    pub topology_bytes: u32,
+}
+
+/// What stays from one stream to the next (15.4).
+#[derive(Debug, Default)]
+pub struct Kept {
+    /// `patches`, `topology_bytes` and `topology_hash` of the last header.
+    of: (u32, u32, u64),
+    patches: HashMap<u32, Vec<u8>>,
+}
+
 struct Header {
     residual: bool,
     lengths: [u32; 3],
@@ -36,18 +59,21 @@ struct Header {
     step: u8,
     slices: u32,
     points: u32,
+    patches: u32,
+    topology_bytes: u32,
+    topology_hash: u64,
 }
 
-/// Reads all of `bytes` with room for `room` instances, buckets and cells.
-pub fn read(bytes: &[u8], room: [u32; 3]) -> Read {
+/// Reads all of `bytes`, after other streams that left `kept`.
+pub fn read(bytes: &[u8], room: Room, kept: &mut Kept) -> Read {
     let mut read = Read::default();
-    if let Err(error) = read_stream(bytes, room, &mut read) {
+    if let Err(error) = read_stream(bytes, room, kept, &mut read) {
         read.error = Some(error);
     }
     read
 }
 
-fn read_stream(bytes: &[u8], room: [u32; 3], out: &mut Read) -> Result<(), String> {
+fn read_stream(bytes: &[u8], room: Room, kept: &mut Kept, out: &mut Read) -> Result<(), String> {
     // 2.2
     let preamble = [0x89, 0x50, 0x53, 0x41, 0x4f, 0x0d, 0x0a, 0x1a];
     let begin = bytes.len().min(8);
@@ -62,7 +88,7 @@ fn read_stream(bytes: &[u8], room: [u32; 3], out: &mut Read) -> Result<(), Strin
     let mut live = false;
     let mut in_snapshot = false;
     let mut mirror: [Buffer; 3] = Default::default();
-    let mut open_slices: HashMap<u32, Slice> = HashMap::new();
+    let mut slices: BTreeMap<u32, Slice> = BTreeMap::new();
 
     while at < bytes.len() {
         if out.ended {
@@ -100,19 +126,32 @@ fn read_stream(bytes: &[u8], room: [u32; 3], out: &mut Read) -> Result<(), Strin
         // 2.6
         let allowed = match kind {
             2 | 5 => 0b11,
-            1 | 3 | 4 => 0,
+            1 | 3 | 4 | 6 => 0,
             _ => 0xff,
         };
         if flags & !allowed != 0 {
             return Err("2.6: flags".into());
         }
         match kind {
-            1 if header.is_none() => header = Some(read_header(body, room)?),
+            1 if header.is_none() => {
+                let read = read_header(body, room)?;
+                // 15.4
+                let of = (read.patches, read.topology_bytes, read.topology_hash);
+                if kept.of != of || read.topology_hash == 0 {
+                    kept.patches.clear();
+                }
+                kept.of = of;
+                header = Some(read);
+            }
             4 if header.is_none() => return Err("3.4: refused".into()),
             _ if header.is_none() => return Err("3.2: no header".into()),
             1 | 4 => return Err("3.2: after the header".into()),
-            5 if !header.as_ref().is_some_and(|h| h.residual) => {
-                return Err("3.2: slices in profile cells".into());
+            5 | 6 if !header.as_ref().is_some_and(|h| h.residual) => {
+                return Err("3.2: slices or patches in profile cells".into());
+            }
+            6 => {
+                let header = header.as_ref().expect("checked above");
+                read_patches(body, header, &mut kept.patches)?;
             }
             2 | 5 => {
                 // 5.1
@@ -142,19 +181,19 @@ fn read_stream(bytes: &[u8], room: [u32; 3], out: &mut Read) -> Result<(), Strin
                 open = if last { None } else { Some((id, time_ns)) };
                 if snapshot {
                     mirror = Default::default();
-                    open_slices.clear();
+                    slices.clear();
                     in_snapshot = true;
                 }
                 if !live && !in_snapshot {
                     continue; // 5.6: withheld
                 }
                 if kind == 2 {
-                    apply(&body[24..], raw_bytes, header.lengths, &mut mirror)?;
+                    apply(&body[24..], raw_bytes, header, &slices, &mut mirror)?;
                 } else {
                     if body.len() - 24 != raw_bytes as usize {
-                        return Err("15.2: raw_bytes".into());
+                        return Err("15.5: raw_bytes".into());
                     }
-                    apply_items(&body[24..], header, &mut mirror, &mut open_slices)?;
+                    apply_items(&body[24..], header, &kept.patches, &mut mirror, &mut slices)?;
                 }
                 if !last {
                     continue;
@@ -166,6 +205,10 @@ fn read_stream(bytes: &[u8], room: [u32; 3], out: &mut Read) -> Result<(), Strin
                         time_ns,
                         mirror_hash,
                         mirror: mirror.clone(),
+                        slices: slices
+                            .iter()
+                            .map(|(at, slice)| (*at, slice.shown()))
+                            .collect(),
                     });
                 } else {
                     live = false;
@@ -190,17 +233,27 @@ fn read_stream(bytes: &[u8], room: [u32; 3], out: &mut Read) -> Result<(), Strin
 }
 
 /// Section 4.
-fn read_header(body: &[u8], room: [u32; 3]) -> Result<Header, String> {
-    if body.len() < 60 || u16_at(body, 0) != 1 {
+fn read_header(body: &[u8], room: Room) -> Result<Header, String> {
+    if body.len() < 76 || u16_at(body, 0) != 1 {
         return Err("4.2: length or version".into());
     }
     let (profile, kernel, points, entries) = (body[4], body[5], body[6], body[7]);
     if profile > 1 || kernel > 1 || points != 7 || entries != 8 {
         return Err("4.1: profile, kernel or sizes".into());
     }
-    let lengths = [u32_at(body, 16), u32_at(body, 20), u32_at(body, 24)];
-    let (max_body_bytes, max_raw_bytes) = (u32_at(body, 28), u32_at(body, 32));
-    if !(64..=1 << 22).contains(&max_body_bytes) || max_raw_bytes > 1 << 22 {
+    let header = Header {
+        residual: profile == 1,
+        lengths: [u32_at(body, 16), u32_at(body, 20), u32_at(body, 24)],
+        max_body_bytes: u32_at(body, 28),
+        max_raw_bytes: u32_at(body, 32),
+        step: body[49],
+        slices: u32_at(body, 52),
+        points: u32_at(body, 56),
+        patches: u32_at(body, 60),
+        topology_bytes: u32_at(body, 64),
+        topology_hash: u64_at(body, 68),
+    };
+    if !(64..=1 << 22).contains(&header.max_body_bytes) || header.max_raw_bytes > 1 << 22 {
         return Err("4.1: limits".into());
     }
     for at in [36, 40, 44] {
@@ -212,35 +265,36 @@ fn read_header(body: &[u8], room: [u32; 3]) -> Result<Header, String> {
     if body[50..52] != [0; 2] {
         return Err("4.1: reserved".into());
     }
-    let (step, slices, points) = (body[49], u32_at(body, 52), u32_at(body, 56));
-    let places = 7 * u64::from(lengths[2]);
-    if profile == 0 && (step, slices, points) != (0, 0, 0) {
+    if !header.residual && (body[49] != 0 || body[52..76] != [0; 24]) {
         return Err("4.1: fields of the other profile".into());
     }
-    if profile == 1 && (step == 0 || slices > lengths[2] || u64::from(points) > places) {
-        return Err("4.1: step, slices or points".into());
+    if header.residual && (header.step == 0 || header.lengths[2] > 1 << 29) {
+        return Err("4.1: step or cells".into());
     }
-    if lengths.iter().zip(room).any(|(need, have)| *need > have) {
+    let lacks = header
+        .lengths
+        .iter()
+        .zip(room.lengths)
+        .any(|(need, have)| *need > have)
+        || header.slices > room.slices
+        || header.points > room.points
+        || header.patches > room.patches
+        || header.topology_bytes > room.topology_bytes;
+    if lacks {
         return Err("4.3: room".into());
     }
-    Ok(Header {
-        residual: profile == 1,
-        lengths,
-        max_body_bytes,
-        max_raw_bytes,
-        step,
-        slices,
-        points,
-    })
+    Ok(header)
 }
 
 /// Section 6.
 fn apply(
     compressed: &[u8],
     raw_bytes: u32,
-    lengths: [u32; 3],
+    header: &Header,
+    slices: &BTreeMap<u32, Slice>,
     mirror: &mut [Buffer; 3],
 ) -> Result<(), String> {
+    let lengths = header.lengths;
     if raw_bytes == 0 {
         return if compressed.is_empty() {
             Ok(())
@@ -268,6 +322,9 @@ fn apply(
     if raw.len() != 12 + total {
         return Err("6.2: length".into());
     }
+    if header.residual && counts[1..] != [0, 0] {
+        return Err("6: buckets or cells in profile residual".into());
+    }
     let mut at = 12;
     for kind in 0..3 {
         let (count, size) = (counts[kind], sizes[kind]);
@@ -282,7 +339,15 @@ fn apply(
             }
             let value = &raw[values + size * element..values + size * (element + 1)];
             match kind {
-                0 => check_instance(value, lengths)?,
+                0 => {
+                    check_instance(value, lengths)?;
+                    if slices
+                        .values()
+                        .any(|slice| u64::from(slice.instance) == index)
+                    {
+                        return Err("6: an instance with an open slice".into());
+                    }
+                }
                 1 => {
                     for entry in 0..8 {
                         let cell = u32_at(value, 4 * entry);
@@ -321,7 +386,7 @@ fn check_instance(value: &[u8], lengths: [u32; 3]) -> Result<(), String> {
         && positive.iter().all(|v| v.is_finite() && *v > 0.0)
         && dims.iter().all(|d| (1..=1 << 20).contains(d))
         && u64::from(bucket_first) + u64::from(bucket_count) <= u64::from(lengths[1])
-        && u32_at(value, 60) == 0;
+        && u32_at(value, 60) <= 3;
     if good {
         Ok(())
     } else {
@@ -329,73 +394,242 @@ fn check_instance(value: &[u8], lengths: [u32; 3]) -> Result<(), String> {
     }
 }
 
-/// 15.3: a slice that was opened.
-struct Slice {
-    /// The cell of each point, and its place in it.
-    places: Vec<(u32, usize)>,
-    cells: std::ops::Range<u32>,
-    earlier: Vec<Vec<usize>>,
-    later: Vec<Vec<usize>>,
-    last: Vec<i64>,
-}
-
-/// 15.2 to 15.4
-fn apply_items(
-    content: &[u8],
+/// 15.4: the body of a patches packet.
+fn read_patches(
+    body: &[u8],
     header: &Header,
-    mirror: &mut [Buffer; 3],
-    slices: &mut HashMap<u32, Slice>,
+    patches: &mut HashMap<u32, Vec<u8>>,
 ) -> Result<(), String> {
     let mut at = 0;
     let mut next = 0u64;
-    while at < content.len() {
-        let head = varint(content, &mut at)?;
-        let index = next + u64::from(head / 2);
-        next = index + 1;
-        if next > u64::from(u32::MAX) {
-            return Err("6.3: index".into());
+    while at < body.len() {
+        let gap = varint(body, &mut at)?;
+        let index = gap_index(&mut next, gap)?;
+        let data = take(body, &mut at)?;
+        if index >= header.patches {
+            return Err("15.4: index".into());
         }
-        let (index, opens) = (index as u32, head % 2 == 1);
-        if opens {
-            let instance = varint(content, &mut at)?;
-            let first = varint(content, &mut at)?;
-            let count = varint(content, &mut at)?;
-            if index >= header.slices || slices.contains_key(&index) {
-                return Err("15.3: index".into());
+        if data.is_empty() {
+            return Err("15.4: no data".into());
+        }
+        match patches.get(&index) {
+            Some(had) if had != data => return Err("15.4: other data".into()),
+            Some(_) => {}
+            None => {
+                patches.insert(index, data.to_vec());
             }
-            let slice = open_slice(header, mirror, instance, first, count)?;
-            let used: usize = slices.values().map(|slice| slice.places.len()).sum();
-            if used + slice.places.len() > header.points as usize {
-                return Err("15.3: points in all".into());
-            }
-            slices.insert(index, slice);
         }
-        let length = varint(content, &mut at)? as usize;
-        if length > content.len() - at {
-            return Err("15.2: length".into());
-        }
-        let data = &content[at..at + length];
-        at += length;
-        let slice = slices.get_mut(&index).ok_or("15.3: not open")?;
-        // 15.4
-        if places(&mirror[2], slice.cells.clone()).len() != slice.places.len() {
-            return Err("15.4: other points".into());
-        }
-        slice.places = places(&mirror[2], slice.cells.clone());
-        let mut occlusion = Vec::new();
-        for (cell, place) in &slice.places {
-            occlusion.push(i64::from(mirror[2][cell][4 + 4 * place]));
-        }
-        let step = if opens { 1 } else { i64::from(header.step) };
-        decode(data, opens, step, &mut occlusion, slice)?;
-        for ((cell, place), value) in slice.places.iter().zip(occlusion) {
-            let bytes = mirror[2].get_mut(cell).expect("its point was just read");
-            bytes[4 + 4 * place] = value as u8;
+        let bytes: usize = patches.values().map(|data| data.len()).sum();
+        if bytes > header.topology_bytes as usize {
+            return Err("15.4: topology_bytes".into());
         }
     }
     Ok(())
 }
 
+/// 15.5: a slice that was opened.
+struct Slice {
+    instance: u32,
+    /// Numbers of its points, of all that the header announces.
+    numbers: Range<u64>,
+    points: Vec<Point>,
+    /// 15.8: whether a block's points are in cells.
+    shown: Vec<bool>,
+    /// Neighbours for the item that opens it, and for those after.
+    first_earlier: Vec<Vec<usize>>,
+    earlier: Vec<Vec<usize>>,
+    later: Vec<Vec<usize>>,
+}
+
+/// A point of a slice.
+struct Point {
+    /// Its bucket, its cell's key, and what its place holds with the occlusion 0; none: no bin.
+    bin: Option<(u32, u32, u32)>,
+    /// The cell that it is in, and its place there.
+    place: Option<(u32, usize)>,
+    occlusion: i64,
+    last: i64,
+}
+
+impl Slice {
+    fn shown(&self) -> (u32, Vec<u8>) {
+        let occlusion = self.points.iter().map(|point| point.occlusion as u8);
+        (self.numbers.start as u32, occlusion.collect())
+    }
+}
+
+/// 15.5
+fn apply_items(
+    content: &[u8],
+    header: &Header,
+    patches: &HashMap<u32, Vec<u8>>,
+    mirror: &mut [Buffer; 3],
+    slices: &mut BTreeMap<u32, Slice>,
+) -> Result<(), String> {
+    let mut at = 0;
+    let mut next = 0u64;
+    while at < content.len() {
+        let head = varint(content, &mut at)?;
+        let index = gap_index(&mut next, head / 4)?;
+        let [update, open, close] = [0, 2, 3].map(|what| head % 4 == what);
+        if index >= header.slices {
+            return Err("15.5: index".into());
+        }
+        if slices.contains_key(&index) == open {
+            return Err("15.5: open, or not open".into());
+        }
+        if open {
+            let instance = varint(content, &mut at)?;
+            let patch = varint(content, &mut at)?;
+            let first = varint(content, &mut at)?;
+            let slice = open_slice(header, patches, mirror, instance, patch, first)?;
+            let numbers = &slice.numbers;
+            let taken = |other: &Slice| {
+                numbers.start < other.numbers.end && other.numbers.start < numbers.end
+            };
+            if slices.values().any(taken) {
+                return Err("15.5: points of another slice".into());
+            }
+            slices.insert(index, slice);
+        }
+        let slice = slices.get_mut(&index).expect("checked above");
+        if close {
+            for point in &mut slice.points {
+                take_out(mirror, point);
+            }
+            slices.remove(&index);
+            continue;
+        }
+        let mut shown = slice.shown.clone();
+        if !update {
+            let bytes = slice.points.len().div_ceil(128);
+            let bits = content.get(at..at + bytes).ok_or("15.5: length")?;
+            at += bytes;
+            for bit in 0..8 * bytes {
+                let set = bits[bit / 8] >> (bit % 8) & 1 == 1;
+                match shown.get_mut(bit) {
+                    Some(shown) => *shown = set,
+                    None if set => return Err("15.8: a bit without a block".into()),
+                    None => {}
+                }
+            }
+        }
+        let data = take(content, &mut at)?;
+        let step = if open { 1 } else { i64::from(header.step) };
+        decode(data, open, step, slice)?;
+        // 15.8
+        for point in &slice.points {
+            if let Some((cell, place)) = point.place {
+                let cell = mirror[2].get_mut(&cell).expect("it has this point");
+                cell[4 + 4 * place] = point.occlusion as u8;
+            }
+        }
+        for (at, point) in slice.points.iter_mut().enumerate() {
+            if slice.shown[at / 16] && !shown[at / 16] {
+                take_out(mirror, point);
+            }
+        }
+        for (at, point) in slice.points.iter_mut().enumerate() {
+            if !slice.shown[at / 16] && shown[at / 16] {
+                put_in(mirror, header.lengths[2], point);
+            }
+        }
+        slice.shown = shown;
+    }
+    Ok(())
+}
+
+/// 15.8
+fn put_in(mirror: &mut [Buffer; 3], cells: u32, point: &mut Point) {
+    let Some((bucket, key, packed)) = point.bin else {
+        return;
+    };
+    let [_, buckets, all] = mirror;
+    let entries = buckets.get(&bucket).map_or([0; 8], |b| words(b));
+    let named = entries.iter().take_while(|entry| **entry != 0);
+    let found = named.copied().find(|cell| u32_at(&all[cell], 0) == key);
+    let empty = entries.iter().position(|entry| *entry == 0);
+    // A cell that is in use has a point, so it is among those that are not all zero.
+    let unused = || (1..cells).find(|cell| !all.contains_key(cell));
+    let index = match (found, empty) {
+        (Some(cell), _) => cell,
+        (None, None) => return,
+        (None, Some(empty)) => {
+            let Some(cell) = unused() else {
+                return;
+            };
+            set_word(buckets.entry(bucket).or_insert(vec![0; 32]), empty, cell);
+            set_word(all.entry(cell).or_insert(vec![0; 32]), 0, key);
+            cell
+        }
+    };
+    let cell = all.get_mut(&index).expect("a bucket names it");
+    if let Some(place) = (0..7).find(|place| u32_at(cell, 4 + 4 * place) >> 31 == 0) {
+        set_word(cell, 1 + place, packed | point.occlusion as u32);
+        point.place = Some((index, place));
+    }
+}
+
+/// 15.8
+fn take_out(mirror: &mut [Buffer; 3], point: &mut Point) {
+    let Some((index, place)) = point.place.take() else {
+        return;
+    };
+    let [_, buckets, cells] = mirror;
+    let cell = cells.get_mut(&index).expect("it has this point");
+    set_word(cell, 1 + place, 1);
+    for place in (0..7).rev() {
+        if u32_at(cell, 4 + 4 * place) >> 31 == 1 {
+            return;
+        }
+        set_word(cell, 1 + place, 0);
+    }
+    cells.remove(&index);
+    let bucket = point.bin.expect("it is in a cell").0;
+    let entries = buckets.get_mut(&bucket).expect("it names the cell");
+    let list: [u32; 8] = words(entries);
+    let named = list
+        .iter()
+        .position(|entry| *entry == index)
+        .expect("it names the cell");
+    let last = list.iter().take_while(|entry| **entry != 0).count() - 1;
+    set_word(entries, named, list[last]);
+    set_word(entries, last, 0);
+    if last == 0 {
+        buckets.remove(&bucket);
+    }
+}
+
+/// The words of a bucket.
+fn words(bytes: &[u8]) -> [u32; 8] {
+    [0, 1, 2, 3, 4, 5, 6, 7].map(|word| u32_at(bytes, 4 * word))
+}
+
+fn set_word(bytes: &mut [u8], word: usize, value: u32) {
+    bytes[4 * word..4 * word + 4].copy_from_slice(&value.to_le_bytes());
+}
+
+/// 6.3
+fn gap_index(next: &mut u64, gap: u32) -> Result<u32, String> {
+    let index = *next + u64::from(gap);
+    *next = index + 1;
+    if *next > u64::from(u32::MAX) {
+        return Err("6.3: index".into());
+    }
+    Ok(index as u32)
+}
+
+/// A length, and as many bytes.
+fn take<'a>(bytes: &'a [u8], at: &mut usize) -> Result<&'a [u8], String> {
+    let length = varint(bytes, at)? as usize;
+    if length > bytes.len() - *at {
+        return Err("15.5: length".into());
+    }
+    *at += length;
+    Ok(&bytes[*at - length..*at])
+}
+
+/// 15.2
 fn varint(bytes: &[u8], at: &mut usize) -> Result<u32, String> {
     let mut value = 0u64;
     for group in 0..5 {
@@ -409,73 +643,373 @@ fn varint(bytes: &[u8], at: &mut usize) -> Result<u32, String> {
     Err("15.2: varint".into())
 }
 
-/// The points of a run of cells: cell and place.
-fn places(cells: &Buffer, run: std::ops::Range<u32>) -> Vec<(u32, usize)> {
-    let mut places = Vec::new();
-    for index in run {
-        let Some(cell) = cells.get(&index) else {
-            continue;
-        };
-        for place in 0..7 {
-            if u32_at(cell, 4 + 4 * place) >> 31 == 0 {
-                break;
-            }
-            places.push((index, place));
-        }
-    }
-    places
-}
-
-/// 15.3
+/// 15.5
 fn open_slice(
     header: &Header,
+    patches: &HashMap<u32, Vec<u8>>,
     mirror: &[Buffer; 3],
     instance: u32,
+    patch: u32,
     first: u32,
-    count: u32,
 ) -> Result<Slice, String> {
-    let grid = mirror[0].get(&instance).ok_or("15.3: instance")?;
-    if u32_at(grid, 44) == 0 {
-        return Err("15.3: instance without points".into());
+    let placed = |grid: &&Vec<u8>| u32_at(grid, 44) > 0;
+    let grid = mirror[0]
+        .get(&instance)
+        .filter(placed)
+        .ok_or("15.5: instance")?;
+    let data = patches.get(&patch).ok_or("15.5: no such patch")?;
+    let level = u32_at(grid, 60);
+    let mut points = read_patch(data)?;
+    points.retain(|point| u32::from(point.level) >= level);
+    let numbers = u64::from(first)..u64::from(first) + points.len() as u64;
+    if points.is_empty() {
+        return Err("15.5: no points of the level".into());
     }
-    let end = u64::from(first) + u64::from(count);
-    if count == 0 || end > u64::from(header.lengths[2]) {
-        return Err("15.3: cells".into());
+    if numbers.end > u64::from(header.points) {
+        return Err("15.5: beyond the points".into());
     }
-    let cells = first..end as u32;
-    for index in cells.clone() {
-        if places(&mirror[2], index..index + 1).is_empty() {
-            return Err("15.3: a cell without points".into());
-        }
-    }
-    let places = places(&mirror[2], cells.clone());
-    if places.len() > 1024 {
-        return Err("15.3: points of a slice".into());
-    }
-    // 15.6
-    let mut points = Vec::new();
-    for (cell, place) in &places {
-        let cell = &mirror[2][cell];
-        let (key, point) = (u32_at(cell, 0), u32_at(cell, 4 + 4 * place));
-        let row = u32_at(grid, 32);
-        let layer = row.wrapping_mul(u32_at(grid, 36)).max(1);
-        let corner = [key % layer % row, key % layer / row, key / layer];
-        let steps = [point >> 16 & 31, point >> 21 & 31, point >> 26 & 31];
-        let place = [0, 1, 2].map(|axis| corner[axis].wrapping_mul(32).wrapping_add(steps[axis]));
-        points.push((place, (point >> 8) as u8));
-    }
-    let (earlier, later) = neighbours(&points);
+    let placed: Vec<_> = points
+        .iter()
+        .map(|point| (point.position, point.normal))
+        .collect();
+    let (first_earlier, _) = neighbours(&placed, 16);
+    let (earlier, later) = neighbours(&placed, 24);
     Ok(Slice {
-        last: vec![0; places.len()],
-        places,
-        cells,
+        instance,
+        numbers,
+        shown: vec![false; points.len().div_ceil(16)],
+        points: points
+            .iter()
+            .map(|point| Point {
+                bin: bin(point, grid),
+                place: None,
+                occlusion: 255,
+                last: 0,
+            })
+            .collect(),
+        first_earlier,
         earlier,
         later,
     })
 }
 
-/// 15.6: earlier and later neighbours of points, each a place and a normal's code.
-pub fn neighbours(points: &[([u32; 3], u8)]) -> (Vec<Vec<usize>>, Vec<Vec<usize>>) {
+/// 15.3, 9.3, 7.8: a point's bucket, key and packed self.
+fn bin(point: &PatchPoint, grid: &[u8]) -> Option<(u32, u32, u32)> {
+    let m = [65536, 46341, 32768, 23170][u32_at(grid, 60) as usize];
+    let bins = point
+        .position
+        .map(|position| ((2 * u64::from(position) + 1) * m) >> 17);
+    let cell = bins.map(|bin| (bin >> 5) as u32);
+    let dims = [32, 36, 40].map(|at| u32_at(grid, at));
+    if (0..3).any(|axis| cell[axis] >= dims[axis]) {
+        return None;
+    }
+    let [x, y, z] = cell;
+    let row = dims[0];
+    let layer = row.wrapping_mul(dims[1]);
+    let combine = |by_y: u32, by_z: u32| {
+        let rows = y.wrapping_mul(row).wrapping_mul(by_y);
+        x.wrapping_add(rows)
+            .wrapping_add(z.wrapping_mul(layer).wrapping_mul(by_z))
+    };
+    let bucket = u32_at(grid, 28) + combine(17, 31) % u32_at(grid, 44);
+    let place = bins.map(|bin| (bin & 31) as u32);
+    let packed = 1 << 31 | place[2] << 26 | place[1] << 21 | place[0] << 16;
+    Some((bucket, combine(1, 1), packed | u32::from(point.normal) << 8))
+}
+
+/// 15.3: a point of a patch.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PatchPoint {
+    pub position: [u32; 3],
+    pub normal: u8,
+    pub level: u8,
+}
+
+/// 15.6: all points of a patch.
+pub fn read_patch(data: &[u8]) -> Result<Vec<PatchPoint>, String> {
+    let (mut patch, count, bits, _) = begin_patch(data)?;
+    patch.read_part(count, 0, [0; 3], bits)?;
+    patch.coder.check_end()?;
+    Ok(patch.points)
+}
+
+/// A patch of the same decisions, up to the one where it is refused if it is, with the right end:
+/// what is wrong with it is then not its end. `None` if not even its corner can be read.
+pub fn patch_with_right_end(data: &[u8]) -> Option<Vec<u8>> {
+    let (mut patch, count, bits, start) = begin_patch(data).ok()?;
+    let _ = patch.read_part(count, 0, [0; 3], bits);
+    Some([&data[..start], &patch.coder.with_right_end()].concat())
+}
+
+/// What comes before the decisions: the number of points, their bits, and how many bytes it is.
+fn begin_patch(data: &[u8]) -> Result<(Patch<'_>, u32, [u32; 3], usize), String> {
+    let mut at = 0;
+    let count = varint(data, &mut at)?;
+    let corner = [
+        varint(data, &mut at)?,
+        varint(data, &mut at)?,
+        varint(data, &mut at)?,
+    ];
+    let bits = data.get(at..at + 3).ok_or("15.6: length")?;
+    let bits = [bits[0], bits[1], bits[2]].map(u32::from);
+    if !(1..=1024).contains(&count)
+        || corner.iter().any(|corner| *corner >= 1 << 25)
+        || bits.iter().any(|bits| *bits > 25)
+    {
+        return Err("15.6: points, corner or bits".into());
+    }
+    // The axis that gives a bit at each depth.
+    let mut order = Vec::new();
+    let mut left = bits;
+    while left != [0; 3] {
+        let most = *left.iter().max().expect("three axes");
+        let axis = left
+            .iter()
+            .position(|left| *left == most)
+            .expect("one has the most");
+        left[axis] -= 1;
+        order.push(axis);
+    }
+    let patch = Patch {
+        coder: Coder::new(&data[at + 3..]),
+        odds: PATCH_TABLES.clone(),
+        state: vec![0; order.len()],
+        order,
+        corner,
+        points: Vec::new(),
+        offsets: Vec::new(),
+        before: [7; 2],
+        other: [7; 2],
+        same: true,
+        distance_bits: 0,
+    };
+    Ok((patch, count, bits, at + 3))
+}
+
+/// A patch that is being read.
+struct Patch<'a> {
+    coder: Coder<'a>,
+    odds: Tables,
+    order: Vec<usize>,
+    /// Of each depth.
+    state: Vec<usize>,
+    corner: [u32; 3],
+    points: Vec<PatchPoint>,
+    offsets: Vec<[i64; 3]>,
+    /// Normals: of the point before, and the last one that was another.
+    before: [u8; 2],
+    other: [u8; 2],
+    /// Whether the point before had the normal of the one before it.
+    same: bool,
+    /// At the last point that had a distance.
+    distance_bits: usize,
+}
+
+impl Patch<'_> {
+    fn decide(&mut self, name: &str, row: usize, column: usize) -> bool {
+        let rows = self.odds.get_mut(name).expect(name);
+        self.coder.decide(&mut rows[row][column])
+    }
+
+    /// 15.6: a number less than `limit`.
+    fn less_than(&mut self, limit: u32, name: &str, row: usize) -> u32 {
+        let (mut low, mut high) = (0, limit);
+        while high - low > 1 {
+            let middle = (low + high) / 2;
+            if self.decide(name, row, middle as usize - 1) {
+                low = middle;
+            } else {
+                high = middle;
+            }
+        }
+        low
+    }
+
+    /// Plain bits, as many as one likes: those above the lowest 16 first.
+    fn plain(&mut self, bits: u32) -> u32 {
+        if bits > 16 {
+            let above = self.coder.plain(bits - 16);
+            return above << 16 | self.coder.plain(16);
+        }
+        self.coder.plain(bits)
+    }
+
+    /// A part of `count` points, whose offsets begin with the bits of `known`, and have `left`
+    /// more along each axis.
+    fn read_part(
+        &mut self,
+        count: u32,
+        depth: usize,
+        known: [u32; 3],
+        mut left: [u32; 3],
+    ) -> Result<(), String> {
+        if count == 1 || depth == self.order.len() {
+            for _ in 0..count {
+                self.read_point(known, left)?;
+            }
+            return Ok(());
+        }
+        let axis = self.order[depth];
+        left[axis] -= 1;
+        let class = match count {
+            2 => 0,
+            3 | 4 => 1,
+            _ => 2,
+        };
+        let state = self.state[depth];
+        let below = if !self.decide("both", left[axis] as usize, 4 * class + state) {
+            let above = self.decide("above", 0, state);
+            self.state[depth] = if above { 3 } else { 2 };
+            if above { 0 } else { count }
+        } else {
+            self.state[depth] = 1;
+            if count == 2 {
+                1
+            } else if count <= 16 {
+                1 + self.less_than(count - 1, "few", count as usize - 3)
+            } else {
+                let s = self.less_than(16, "many", 0);
+                let bits = 32 - (count / 16).leading_zeros();
+                let below = (s * count).div_ceil(16) + self.plain(bits);
+                if below < 1 || below >= count {
+                    return Err("15.6: below".into());
+                }
+                below
+            }
+        };
+        if below > 0 {
+            self.read_part(below, depth + 1, known, left)?;
+        }
+        if below < count {
+            let mut upper = known;
+            upper[axis] |= 1 << left[axis];
+            self.read_part(count - below, depth + 1, upper, left)?;
+        }
+        Ok(())
+    }
+
+    /// 15.7
+    fn read_point(&mut self, known: [u32; 3], left: [u32; 3]) -> Result<(), String> {
+        let row = self
+            .points
+            .last()
+            .map_or(0, |point| usize::from(point.level));
+        let mut level = 0;
+        while level < 3 && self.decide("level", row, level) {
+            level += 1;
+        }
+        let normal = self.read_normal()?;
+
+        let step = normal_steps(normal);
+        let largest = step
+            .iter()
+            .map(|step| step.abs())
+            .max()
+            .expect("three axes");
+        let across = step
+            .iter()
+            .position(|s| s.abs() == largest)
+            .expect("one is the largest");
+        let others: Vec<usize> = (0..3).filter(|axis| *axis != across).collect();
+        let mut offset = known.map(i64::from);
+        for &axis in &others {
+            offset[axis] += i64::from(self.plain(left[axis]));
+        }
+        if left[across] > 0 {
+            let low = offset[across];
+            let high = low + (1 << left[across]) - 1;
+            let mut nearest: Option<(i64, [i64; 3])> = None;
+            for (that, point) in self.offsets.iter().zip(&self.points).rev().take(8) {
+                let apart: i64 = others.iter().map(|&a| (offset[a] - that[a]).abs()).sum();
+                let far = apart + if point.normal == normal { 0 } else { 64 };
+                if nearest.is_none_or(|(least, _)| far < least) {
+                    nearest = Some((far, *that));
+                }
+            }
+            let c = step[across];
+            let predicted = nearest.map_or(0, |(_, that)| {
+                let e: i64 = others
+                    .iter()
+                    .map(|&a| (offset[a] - that[a]) * step[a])
+                    .sum();
+                that[across] - (2 * e * c.signum() + c.abs()).div_euclid(2 * c.abs())
+            });
+            let predicted = predicted.clamp(low, high);
+            let alone = step.iter().filter(|step| **step != 0).count() == 1;
+            let row = 2 * self.distance_bits.min(3) + usize::from(alone);
+            let mut bits = 0;
+            while bits < 27 && self.decide("across", row, bits) {
+                bits += 1;
+            }
+            self.distance_bits = bits;
+            offset[across] = predicted;
+            if bits > 0 {
+                let distance = 1 << (bits - 1) | i64::from(self.plain(bits as u32 - 1));
+                let above = if predicted == low {
+                    true
+                } else if predicted == high {
+                    false
+                } else {
+                    self.decide("up", 0, 0)
+                };
+                offset[across] += if above { distance } else { -distance };
+            }
+            if !(low..=high).contains(&offset[across]) {
+                return Err("15.7: offset".into());
+            }
+        }
+        let position = [0, 1, 2].map(|axis| self.corner[axis] + offset[axis] as u32);
+        if position.iter().any(|position| *position >= 1 << 25) {
+            return Err("15.6: position".into());
+        }
+        self.offsets.push(offset);
+        self.points.push(PatchPoint {
+            position,
+            normal,
+            level: level as u8,
+        });
+        Ok(())
+    }
+
+    /// 15.7
+    fn read_normal(&mut self) -> Result<u8, String> {
+        self.same = self.decide("same", 0, usize::from(!self.same));
+        let mut normal = self.before;
+        if !self.same {
+            let so_far = self.other;
+            self.other = self.before;
+            if self.decide("again", 0, 0) {
+                normal = so_far;
+            } else {
+                let mut differed = 0;
+                for axis in 0..2 {
+                    if !self.decide("some", 0, axis + differed) {
+                        continue;
+                    }
+                    differed = 1;
+                    let less = self.decide("down", 0, axis);
+                    let mut amount = 1;
+                    while amount < 14 && self.decide("more", axis, (amount - 1).min(5)) {
+                        amount += 1;
+                    }
+                    let code = i64::from(normal[axis]);
+                    let code = code + amount as i64 * if less { -1 } else { 1 };
+                    if !(0..=14).contains(&code) {
+                        return Err("15.7: normal".into());
+                    }
+                    normal[axis] = code as u8;
+                }
+            }
+        }
+        self.before = normal;
+        Ok(normal[0] + 16 * normal[1])
+    }
+}
+
+/// 15.10: earlier and later neighbours of points, each a position and a normal's code, among the
+/// `window` before and after each.
+pub fn neighbours(points: &[([u32; 3], u8)], window: usize) -> (Vec<Vec<usize>>, Vec<Vec<usize>>) {
     let most = u64::from(u32::MAX);
     let normals: Vec<[i64; 3]> = (0..=255).map(normal_steps).collect();
     let distance = |a: usize, b: usize| {
@@ -486,7 +1020,12 @@ pub fn neighbours(points: &[([u32; 3], u8)]) -> (Vec<Vec<usize>>, Vec<Vec<usize>
             s += u64::from(p.0[axis].abs_diff(q.0[axis]).min(16384)).pow(2);
             dot += normals[usize::from(p.1)][axis] * normals[usize::from(q.1)][axis];
         }
-        let t = ((16129 - dot).max(0) >> 6) as u64;
+        let turned = if p.1 == q.1 {
+            0
+        } else {
+            (16129 - dot).max(0) >> 6
+        };
+        let t = turned as u64;
         s + (2 * t + ((s * t) >> 5).min(most)).min(most)
     };
     let nearest = |at: usize, others: Vec<usize>| {
@@ -506,14 +1045,14 @@ pub fn neighbours(points: &[([u32; 3], u8)]) -> (Vec<Vec<usize>>, Vec<Vec<usize>
     };
     let (mut earlier, mut later) = (Vec::new(), Vec::new());
     for at in 0..points.len() {
-        earlier.push(nearest(at, (at.saturating_sub(128)..at).collect()));
-        let end = (at + 129).min(points.len());
+        earlier.push(nearest(at, (at.saturating_sub(window)..at).collect()));
+        let end = (at + window + 1).min(points.len());
         later.push(nearest(at, (at + 1..end).collect()));
     }
     (earlier, later)
 }
 
-/// 15.6: a normal in steps.
+/// 15.10: a normal in steps.
 pub fn normal_steps(code: u8) -> [i64; 3] {
     let a = i64::from(code % 16).min(14) - 7;
     let b = i64::from(code / 16).min(14) - 7;
@@ -535,7 +1074,7 @@ pub fn normal_steps(code: u8) -> [i64; 3] {
     })
 }
 
-/// 15.5: fast and slow.
+/// 15.9: fast and slow.
 #[derive(Clone, Copy)]
 struct Odds(u64, u64);
 
@@ -555,7 +1094,7 @@ impl Odds {
     }
 }
 
-/// 15.5
+/// 15.9
 struct Coder<'a> {
     data: &'a [u8],
     taken: usize,
@@ -583,30 +1122,77 @@ impl Coder<'_> {
             self.code = self.code.wrapping_sub(bound);
             self.range -= bound;
         }
+        self.refill();
+        yes
+    }
+
+    fn plain(&mut self, bits: u32) -> u32 {
+        if bits == 0 {
+            return 0;
+        }
+        self.range >>= bits;
+        let number = (self.code / self.range).min((1 << bits) - 1);
+        self.code = self.code.wrapping_sub(number * self.range);
+        self.refill();
+        number as u32
+    }
+
+    fn refill(&mut self) {
         if self.range < 1 << 32 {
             self.code = (self.code << 32) + number(self.data, self.taken, 4);
             self.taken += 4;
             self.range <<= 32;
         }
-        yes
     }
 
-    fn check_end(&self) -> Result<(), String> {
-        let s = self.taken - 8;
-        let v = number(self.data, s, 8);
+    /// What is taken from the interval's lower end on, that end, the number that the data end
+    /// with, and how many bytes of it count.
+    fn end(&self) -> (u64, u64, u64, usize) {
+        let v = number(self.data, self.taken - 8, 8);
         let low = v.wrapping_sub(self.code);
         for k in 0..=8 {
             let multiple = 1u128 << (64 - 8 * k);
             let n = (u128::from(low).div_ceil(multiple) * multiple) as u64;
             if n.wrapping_sub(low) < self.range {
-                return if n == v && self.data.len() == s + k {
-                    Ok(())
-                } else {
-                    Err("15.5: end of the data".into())
-                };
+                return (v, low, n, k);
             }
         }
         unreachable!("with k = 8, n is low")
+    }
+
+    fn check_end(&self) -> Result<(), String> {
+        let (v, _, n, k) = self.end();
+        if n == v && self.data.len() == self.taken - 8 + k {
+            Ok(())
+        } else {
+            Err("15.9: end of the data".into())
+        }
+    }
+
+    /// Data of the same decisions as were read, and with the right end.
+    fn with_right_end(&self) -> Vec<u8> {
+        let (v, low, n, k) = self.end();
+        let before = 0..self.taken - 8;
+        let mut bytes: Vec<u8> = before.map(|at| number(self.data, at, 1) as u8).collect();
+        let mut last = bytes.len();
+        while v < low && last > 0 {
+            // The interval begins below the last of these numbers.
+            last -= 1;
+            bytes[last] = bytes[last].wrapping_sub(1);
+            if bytes[last] != 255 {
+                break;
+            }
+        }
+        let mut last = bytes.len();
+        while n < low && last > 0 {
+            last -= 1;
+            bytes[last] = bytes[last].wrapping_add(1);
+            if bytes[last] != 0 {
+                break;
+            }
+        }
+        bytes.extend(&n.to_be_bytes()[..k]);
+        bytes
     }
 }
 
@@ -617,121 +1203,118 @@ fn number(data: &[u8], at: usize, bytes: usize) -> u64 {
     })
 }
 
-/// 15.7
-#[derive(Clone)]
-struct Tables {
-    block: Vec<Vec<Odds>>,
-    some: Vec<Vec<Odds>>,
-    down: Vec<Vec<Odds>>,
-    more: Vec<Vec<Odds>>,
-}
+/// 15.11
+type Tables = HashMap<String, Vec<Vec<Odds>>>;
 
-impl Tables {
-    /// Out of the document itself.
-    fn named(title: &str) -> Tables {
-        let document = include_str!("../docs/format.md");
-        let (_, rest) = document.split_once(&format!("```{title}\n")).expect(title);
-        let (table, _) = rest.split_once("```").expect("the table ends");
-        let rows = |name: &str, count: usize, columns: usize| {
-            let mut rows = Vec::new();
-            for line in table.lines() {
-                let mut words = line.split_whitespace();
-                if words.next() == Some(name) {
-                    let row: Vec<Odds> = words.map(|n| Odds::new(n.parse().unwrap())).collect();
-                    assert_eq!(row.len(), columns, "{line}");
-                    rows.push(row);
-                }
-            }
-            assert_eq!(rows.len(), count, "{name}");
-            rows
-        };
-        Tables {
-            block: rows("block", 4, 5),
-            some: rows("some", 12, 10),
-            down: rows("down", 5, 4),
-            more: rows("more", 14, 12),
-        }
+/// Out of the document itself: rows by their names.
+fn tables(title: &str) -> Tables {
+    let document = include_str!("../docs/format.md");
+    let (_, rest) = document.split_once(&format!("```{title}\n")).expect(title);
+    let (lines, _) = rest.split_once("```").expect("the table ends");
+    let mut tables = Tables::new();
+    for line in lines.lines() {
+        let mut words = line.split_whitespace();
+        let name = words.next().expect("a row has a name");
+        let row = words.map(|n| Odds::new(n.parse().unwrap())).collect();
+        tables.entry(name.into()).or_default().push(row);
     }
+    tables
 }
 
-/// Later items, and items that open.
-static TABLES: LazyLock<[Tables; 2]> =
-    LazyLock::new(|| ["odds later items", "odds items that open"].map(Tables::named));
+/// Of later items, of items that open, and of patches.
+static LATER: LazyLock<Tables> = LazyLock::new(|| tables("odds later items"));
+static OPENING: LazyLock<Tables> = LazyLock::new(|| tables("odds items that open"));
+static PATCH_TABLES: LazyLock<Tables> = LazyLock::new(|| tables("odds patches"));
 
-/// 15.8, 15.9
-fn decode(
-    data: &[u8],
-    opens: bool,
-    step: i64,
-    occlusion: &mut [i64],
-    slice: &mut Slice,
-) -> Result<(), String> {
-    let count = occlusion.len();
+/// What 15.12 keeps of a point during an item.
+#[derive(Clone, Copy)]
+struct Moving {
+    weight: i64,
+    activity: i64,
+}
+
+/// 15.12, 15.13
+fn decode(data: &[u8], opens: bool, step: i64, slice: &mut Slice) -> Result<(), String> {
     let mut coder = Coder::new(data);
-    let mut tables = TABLES[usize::from(opens)].clone();
-    let last = &mut slice.last;
-    if opens {
-        occlusion.fill(255);
-        last.fill(0);
-    }
-    let mut weight: Vec<i64> = last.iter().map(|last| 7 * last).collect();
-    let mut activity: Vec<i64> = last.iter().map(|last| last.abs()).collect();
+    let mut tables = if opens {
+        OPENING.clone()
+    } else {
+        LATER.clone()
+    };
+    let points = &mut slice.points;
+    let mut moving: Vec<Moving> = points
+        .iter()
+        .map(|point| Moving {
+            weight: 7 * point.last,
+            activity: point.last.abs(),
+        })
+        .collect();
     let (mut moved_before, mut moved_before_that) = (0, 0);
-    for start in (0..count).step_by(16) {
-        let block = start..(start + 16).min(count);
-        let changed = block.clone().filter(|&at| last[at] != 0).count();
+    for start in (0..points.len()).step_by(16) {
+        let block = start..(start + 16).min(points.len());
+        let changed = block.clone().filter(|&at| points[at].last != 0).count();
         let column = match changed {
             0..=2 => changed,
             3..=5 => 3,
             _ => 4,
         };
         let row = moved_before + 2 * moved_before_that;
-        let moves = coder.decide(&mut tables.block[row][column]);
+        let block_odds = tables.get_mut("block").expect("a table");
+        let moves = coder.decide(&mut block_odds[row][column]);
         moved_before_that = moved_before;
         moved_before = usize::from(moves);
         if !moves {
             for at in block {
-                weight[at] = 3 * last[at];
-                activity[at] = 0;
-                last[at] = 0;
+                moving[at] = Moving {
+                    weight: 3 * points[at].last,
+                    activity: 0,
+                };
+                points[at].last = 0;
             }
             continue;
         }
         for at in block {
             let or_itself = |found: &[usize]| [0, 1, 2].map(|i| *found.get(i).unwrap_or(&at));
-            let earlier = or_itself(&slice.earlier[at]);
-            let later = or_itself(&slice.later[at]);
+            let point = &mut points[at];
             if opens {
-                let weights = earlier.map(|other| weight[other]);
+                let earlier = or_itself(&slice.first_earlier[at]);
+                let weights = earlier.map(|other| moving[other].weight);
                 let dark = (weights.iter().sum::<i64>() * 85 + 128) >> 8;
                 let predicted = 255 - dark;
                 let spread = (weights.iter().max().unwrap() - weights.iter().min().unwrap()) >> 1;
-                let a = earlier.map(|other| activity[other]).iter().sum();
+                let a = earlier.map(|other| moving[other].activity).iter().sum();
                 let steps = steps(&mut coder, &mut tables, predicted, a, spread, 0, 0);
-                occlusion[at] = (predicted + steps * step).clamp(0, 255);
-                weight[at] = 255 - occlusion[at];
-                activity[at] = (occlusion[at] - predicted).abs();
+                point.occlusion = (predicted + steps * step).clamp(0, 255);
+                moving[at] = Moving {
+                    weight: 255 - point.occlusion,
+                    activity: (point.occlusion - predicted).abs(),
+                };
                 continue;
             }
+            let earlier = or_itself(&slice.earlier[at]);
+            let later = or_itself(&slice.later[at]);
             let all = || earlier.iter().chain(&later);
-            let sum = all().map(|&other| weight[other]).sum::<i64>() + 32;
+            let sum = all().map(|&other| moving[other].weight).sum::<i64>() + 32;
             let (change, rounding) = (sum.div_euclid(64), sum.rem_euclid(64));
-            let predicted = (occlusion[at] + change).clamp(0, 255);
-            let a = all().map(|&other| activity[other]).sum::<i64>() + 2 * last[at].abs();
+            let predicted = (point.occlusion + change).clamp(0, 255);
+            let activity: i64 = all().map(|&other| moving[other].activity).sum();
+            let a = activity + 2 * point.last.abs();
             let s = change.abs();
             let steps = steps(&mut coder, &mut tables, predicted, a, s, change, rounding);
             let becomes = (predicted + steps * step).clamp(0, 255);
-            let now = (becomes - occlusion[at]).clamp(-127, 127);
-            occlusion[at] = becomes;
-            weight[at] = 13 * now + 3 * last[at];
-            activity[at] = 2 * now.abs();
-            last[at] = now;
+            let now = (becomes - point.occlusion).clamp(-127, 127);
+            point.occlusion = becomes;
+            moving[at] = Moving {
+                weight: 13 * now + 3 * point.last,
+                activity: 2 * now.abs(),
+            };
+            point.last = now;
         }
     }
     coder.check_end()
 }
 
-/// 15.10
+/// 15.14
 fn steps(
     coder: &mut Coder<'_>,
     tables: &mut Tables,
@@ -748,27 +1331,29 @@ fn steps(
         4 => 3,
         _ => 4,
     };
+    let mut decide = |name: &str, row: usize, column: usize| {
+        coder.decide(&mut tables.get_mut(name).expect(name)[row][column])
+    };
     let open = usize::from(predicted == 255);
-    if !coder.decide(&mut tables.some[kind][2 * size + open]) {
+    if !decide("some", kind, 2 * size + open) {
         return 0;
     }
     let down = match predicted {
         0 => false,
         255 => true,
-        _ => coder.decide(&mut tables.down[(c.clamp(-2, 2) + 2) as usize][(r >> 4) as usize]),
+        _ => decide("down", (c.clamp(-2, 2) + 2) as usize, (r >> 4) as usize),
     };
     let mut magnitude = 1;
-    for row in 0..14 {
-        if !coder.decide(&mut tables.more[row][kind]) {
-            return if down { -magnitude } else { magnitude };
-        }
+    while magnitude < 15 && decide("more", magnitude as usize - 1, kind) {
         magnitude += 1;
     }
-    let mut rest = 0;
-    for _ in 0..8 {
-        rest = 2 * rest + i64::from(coder.decide(&mut Odds::new(128)));
+    if magnitude == 15 {
+        let mut rest = 0;
+        for _ in 0..8 {
+            rest = 2 * rest + i64::from(coder.decide(&mut Odds::new(128)));
+        }
+        magnitude += rest;
     }
-    magnitude += rest;
     if down { -magnitude } else { magnitude }
 }
 
@@ -777,11 +1362,11 @@ fn hash(mirror: &[Buffer; 3]) -> u64 {
     let mut sum = 0u64;
     for (kind, buffer) in mirror.iter().enumerate() {
         for (index, bytes) in buffer {
-            let mut h = mix(((kind as u64 + 1) << 32) + u64::from(*index));
-            for at in (0..bytes.len()).step_by(8) {
-                h = mix(h ^ u64_at(bytes, at));
+            for word in 0..bytes.len() / 4 {
+                let name = (kind as u64 + 1) << 56 | u64::from(*index) << 8 | word as u64;
+                let part = u64::from(u32_at(bytes, 4 * word)).wrapping_mul(mix(name) | 1);
+                sum = sum.wrapping_add(part);
             }
-            sum = sum.wrapping_add(h);
         }
     }
     sum

@@ -24,6 +24,10 @@ const NEEDS: Capacity = Capacity {
     instances: 10,
     buckets: 20,
     cells: 30,
+    slices: 0,
+    points: 0,
+    patches: 0,
+    topology_bytes: 0,
 };
 
 /// After so long a wait has failed.
@@ -73,6 +77,7 @@ impl Server {
             trust: Trust::Fingerprint(self.fingerprint),
             scene_hash: SCENE,
             capacity: NEEDS,
+            topology_hash: 0,
         };
         change(&mut connect);
         Connection::open(connect)
@@ -91,7 +96,7 @@ impl Server {
 
     fn joined(&mut self) -> ClientId {
         match self.next_event() {
-            Event::Joined(id) => id,
+            Event::Joined(id, _) => id,
             other => panic!("{other:?} instead of a client joining"),
         }
     }
@@ -267,6 +272,7 @@ fn hello() -> Vec<u8> {
         token: TOKEN.as_bytes(),
         scene_hash: 0,
         capacity: NEEDS,
+        topology_hash: 0,
     };
     packet(uplink::kind::HELLO, 0, |w| hello.write(w))
 }
@@ -278,6 +284,7 @@ fn camera(x: f64) -> Camera {
         up: [0.0, 1.0, 0.0],
         fov_y_rad: 1.0,
         aspect: 1.5,
+        height_px: 0,
     }
 }
 
@@ -522,6 +529,7 @@ fn arguments_that_cannot_work_are_told_apart() {
             trust: Trust::Fingerprint(server.fingerprint),
             scene_hash: 0,
             capacity: NEEDS,
+            topology_hash: 0,
         };
         let error = Connection::open(connect).err().unwrap();
         assert!(
@@ -547,6 +555,7 @@ fn arguments_that_cannot_work_are_told_apart() {
             trust: Trust::Fingerprint(server.fingerprint),
             scene_hash: 0,
             capacity: NEEDS,
+            topology_hash: 0,
         })
     };
     assert_eq!(connect(&long).err(), Some(ConnectError::Token(257)));
@@ -564,6 +573,7 @@ fn a_name_with_several_addresses_reaches_the_one_that_listens() {
         trust: Trust::RootsPem(server.certificate.clone()),
         scene_hash: 0,
         capacity: NEEDS,
+        topology_hash: 0,
     });
     let _connection = connection.unwrap();
     server.joined();
@@ -582,6 +592,7 @@ fn where_no_server_is_the_error_says_so() {
         trust: Trust::Fingerprint(Fingerprint([0; 32])),
         scene_hash: 0,
         capacity: NEEDS,
+        topology_hash: 0,
     });
     assert_eq!(opened.err(), Some(ConnectError::NoAnswer(address)));
 }
@@ -606,6 +617,7 @@ fn another_protocol_is_turned_away_on_both_sides() {
         trust: Trust::Fingerprint(fingerprint),
         scene_hash: 0,
         capacity: NEEDS,
+        topology_hash: 0,
     });
     assert_eq!(opened.err(), Some(ConnectError::Protocol(address)));
 }
@@ -653,7 +665,7 @@ fn cameras_go_over_the_stream_where_the_server_takes_no_datagrams() {
     let served = runtime.spawn(async move {
         let connection = endpoint.accept().await.unwrap().await.unwrap();
         let (_send, mut receive) = connection.accept_bi().await.unwrap();
-        let mut bytes = vec![0; hello().len() + 2 * 16 + 56 + 4];
+        let mut bytes = vec![0; hello().len() + 2 * 16 + 60 + 4];
         receive.read_exact(&mut bytes).await.unwrap();
         bytes
     });
@@ -664,6 +676,7 @@ fn cameras_go_over_the_stream_where_the_server_takes_no_datagrams() {
         trust: Trust::Fingerprint(fingerprint),
         scene_hash: 0,
         capacity: NEEDS,
+        topology_hash: 0,
     });
     let connection = connection.unwrap();
     connection.camera(&camera(3.0)).unwrap();

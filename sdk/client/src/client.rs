@@ -469,6 +469,15 @@ impl Decoder {
         if self.scene_hash != 0 && self.scene_hash != header.scene_hash {
             return Err(ClientError::Scene(header.scene_hash));
         }
+        // A server that was told that this client has all patches does not send them again,
+        // whatever else its header asks for.
+        let same_topology = header.topology_hash != 0
+            && header.topology_hash == self.topology_hash
+            && need.capacity.patches == self.room.patches
+            && need.capacity.topology_bytes == self.room.topology_bytes;
+        if !same_topology {
+            self.slices.slices().forget_patches();
+        }
         if self.room != need.capacity {
             let empty = Mirror::new(Heap::default());
             let mut memory = std::mem::replace(&mut self.mirror, empty).into_memory();
@@ -478,9 +487,6 @@ impl Decoder {
             self.room = need.capacity;
         } else {
             self.slices.slices().reset(need.capacity.cells);
-            if header.topology_hash == 0 || header.topology_hash != self.topology_hash {
-                self.slices.slices().forget_patches();
-            }
         }
         self.topology_hash = header.topology_hash;
         self.raw.resize_zeroed(need.raw_bytes as usize);

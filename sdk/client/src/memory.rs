@@ -300,13 +300,17 @@ impl SliceHeap {
         }
     }
 
-    /// Room as a header asks for: no patch has come, no slice is open.
+    /// Room as a header asks for: no slice is open. Where the room for patches is the same as it
+    /// was, those that have come stay.
     pub fn resize(&mut self, capacity: Capacity) {
         let points = capacity.points as usize;
+        let topology = [capacity.patches as usize, capacity.topology_bytes as usize];
+        if [self.patches.len(), self.topology.len()] != topology {
+            self.patches.resize_zeroed(topology[0]);
+            self.topology.resize_zeroed(topology[1]);
+            self.slices().forget_patches();
+        }
         self.slices.resize_zeroed(capacity.slices as usize);
-        self.patches.resize_zeroed(capacity.patches as usize);
-        self.topology
-            .resize_zeroed(capacity.topology_bytes as usize);
         self.values.resize_zeroed(points);
         self.last.resize_zeroed(points);
         self.neighbours.resize_zeroed(points);
@@ -314,7 +318,7 @@ impl SliceHeap {
         self.free
             .resize_zeroed(dirty::words(capacity.cells as usize));
         self.scratch.resize_zeroed(PATCH_POINTS);
-        self.slices().forget_patches();
+        self.scratch_of = [0; 3];
         self.slices().reset(capacity.cells);
     }
 
