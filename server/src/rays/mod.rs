@@ -369,7 +369,11 @@ impl CpuTracer {
             };
             let body = Body::new(&corners);
             // Through holes, rays get anywhere.
-            if mesh.mask.is_some() { body } else { body.with_core() }
+            if mesh.mask.is_some() {
+                body
+            } else {
+                body.with_core()
+            }
         };
         let mut tracer = CpuTracer {
             fixed: Body::new(&corners),
