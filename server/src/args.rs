@@ -33,6 +33,9 @@ pub struct SceneArgs {
     /// Rays a point, 1 to 4096
     #[arg(long, value_name = "N", default_value_t = 256)]
     pub rays: usize,
+    /// Steps in which each point near what moves is traced once, in turn with its neighbours
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    pub refresh_steps: u32,
     /// Longest ray, metres
     #[arg(long, value_name = "METRES", default_value_t = 0.6)]
     pub ao_distance: f32,
@@ -155,6 +158,7 @@ impl SceneArgs {
         Ok(Options {
             density: self.density,
             rays: self.rays,
+            refresh_steps: self.refresh_steps,
             ao_distance_m: self.ao_distance,
             seed: self.seed,
             ..Options::of(kernel)

@@ -37,6 +37,10 @@ pub struct Options {
     pub ao_distance_m: f32,
     /// Rays a point, 1 to 4096.
     pub rays: usize,
+    /// Steps in which each point near what moves is traced once, in turn with its neighbours: 1
+    /// for all of them at every step. What a point says lags by up to one step less; all is up to
+    /// date as many steps after the last move. 0 counts as 1.
+    pub refresh_steps: u32,
     /// Kernel that the grid is laid out for.
     pub kernel: Kernel,
     /// Interpolation radius r over the largest Poisson radius rm.
@@ -64,6 +68,7 @@ impl Options {
             density: 512.0,
             ao_distance_m: 0.6,
             rays: 256,
+            refresh_steps: 1,
             kernel,
             radius_over_rm,
             cell_over_radius,
@@ -213,6 +218,10 @@ pub struct World {
     moves: Vec<bool>,
     /// Where each instance that moves is, now and at the step before.
     swept: Vec<[Hull; 2]>,
+    /// Of each slice, which of its points are due.
+    turns: Vec<Turn>,
+    /// Calls of [`World::step`].
+    steps: u64,
     /// Space for what the traced points say, kept from step to step.
     traced: Vec<u8>,
     driven: BTreeMap<u32, DAffine3>,
@@ -271,6 +280,8 @@ impl World {
             topology: Topology::default(),
             fixed: Vec::new(),
             swept: vec![[Hull::default(); 2]; scene.instances.len()],
+            turns: Vec::new(),
+            steps: 0,
             traced: Vec::new(),
             driven: BTreeMap::new(),
             absent: BTreeSet::new(),
@@ -570,10 +581,18 @@ impl World {
         visible: &(dyn Fn([Vec3; 2]) -> bool + Sync),
         converge_rays: u64,
     ) -> StepStats {
+        self.steps += 1;
         self.pose_at(time_s);
         self.mark_stale();
         self.place_deforming(visible);
-        self.trace(visible, converge_rays, self.options.rays, &|_, _| ())
+        let refresh_steps = self.options.refresh_steps.max(1);
+        self.trace(
+            visible,
+            converge_rays,
+            self.options.rays,
+            refresh_steps,
+            &|_, _| (),
+        )
     }
 
     /// Traces all `visible` slices until each point has had `rays` of its rays (all of them if
@@ -586,7 +605,7 @@ impl World {
     ) -> StepStats {
         let mut total = StepStats::default();
         loop {
-            let stats = self.trace(visible, u64::MAX, rays, report);
+            let stats = self.trace(visible, u64::MAX, rays, 1, report);
             total.rays += stats.rays;
             total.points += stats.points;
             if stats.converging == 0 {
@@ -746,22 +765,27 @@ impl World {
     }
 
     /// Traces what is visible and due. Slices with less than `goal` of their rays gain some, as far
-    /// as `converge_rays` goes.
+    /// as `converge_rays` goes. The others take `refresh_steps` turns.
     fn trace(
         &mut self,
         visible: &(dyn Fn([Vec3; 2]) -> bool + Sync),
         converge_rays: u64,
         goal: usize,
+        refresh_steps: u32,
         report: &(dyn Fn(u64, u64) + Sync),
     ) -> StepStats {
         let all = self.options.rays;
         let mut stats = StepStats::default();
-        let mut due: Vec<(usize, usize)> = Vec::new();
+        // Slices, the rays that their points are to have had, and which points.
+        let mut due: Vec<(usize, usize, Share)> = Vec::new();
         let mut budget = converge_rays;
-        for (index, slice) in self.slices.iter().enumerate() {
+        self.turns.resize(self.slices.len(), Turn::default());
+        for (index, (slice, turn)) in self.slices.iter().zip(&mut self.turns).enumerate() {
             if !visible(slice.bounds) || self.absent.contains(&slice.instance) {
                 continue;
             }
+            let followed = turn.seen_at + 1 == self.steps;
+            turn.seen_at = self.steps;
             let points = slice.points.len() as u64;
             stats.rays_if_all += points * all as u64;
             let mut rays = slice.rays_done;
@@ -781,13 +805,22 @@ impl World {
                 }
                 stats.converging += u64::from(rays < goal.min(all));
             }
-            if rays > slice.rays_done || slice.stale && rays > 0 {
-                due.push((index, rays));
+            if slice.stale {
+                turn.owed = refresh_steps;
+            }
+            if rays > slice.rays_done || turn.owed > 0 && rays > 0 {
+                // What comes into view is all due at once, and so are new rays.
+                let share = if rays > slice.rays_done || !followed {
+                    turn.all()
+                } else {
+                    turn.next(refresh_steps)
+                };
+                due.push((index, rays, share));
             }
         }
         let total: u64 = due
             .iter()
-            .map(|&(slice, _)| self.slices[slice].points.len() as u64)
+            .map(|&(slice, ..)| self.slices[slice].points.len() as u64)
             .sum();
         let words = self.words();
         // Out of the world, so that threads can fill their parts of them.
@@ -798,7 +831,7 @@ impl World {
         traced.resize(total as usize, 0);
         let mut batches = Vec::new();
         let (mut bits, mut bits_from, mut occlusion) = (&mut fixed[..], 0, &mut traced[..]);
-        for &(slice, rays) in &due {
+        for &(slice, rays, share) in &due {
             for first in self.slices[slice].points.clone().step_by(BATCH_POINTS) {
                 let last = self.slices[slice]
                     .points
@@ -814,6 +847,7 @@ impl World {
                     slice,
                     points: first..last,
                     rays,
+                    share,
                     fixed: own,
                     occlusion: own_occlusion,
                 });
@@ -833,7 +867,7 @@ impl World {
             .reduce(|| (0, 0), |a, b| (a.0 + b.0, a.1 + b.1));
         (stats.rays, stats.points) = (rays, points);
         let mut occlusion = traced.iter();
-        for &(index, rays) in &due {
+        for &(index, rays, _) in &due {
             let slice = &mut self.slices[index];
             slice.rays_done = rays;
             slice.stale = false;
@@ -889,6 +923,10 @@ impl World {
             .chunks_exact_mut(words)
             .zip(&mut *batch.occlusion);
         for (number, (fixed, occlusion)) in batch.points.clone().zip(parts) {
+            if !batch.share.has(number) {
+                *occlusion = self.occlusion[number as usize];
+                continue;
+            }
             let point = &self.points[number as usize];
             let local = point.position(triangles, positions);
             let position = pose.world_from_local.transform_point3(local);
@@ -1231,12 +1269,52 @@ impl std::error::Error for NoInstance {}
 /// Points of a slice that are traced together: few, so that all threads end together.
 const BATCH_POINTS: usize = 128;
 
+/// The points whose number leaves `rest` when divided by `of`.
+#[derive(Clone, Copy, Debug)]
+struct Share {
+    of: u32,
+    rest: u32,
+}
+
+impl Share {
+    fn has(self, number: u32) -> bool {
+        number % self.of == self.rest
+    }
+}
+
+/// Which of a slice's points were traced last, and how many shares are due.
+#[derive(Clone, Copy, Debug, Default)]
+struct Turn {
+    last: u32,
+    owed: u32,
+    /// The step at which it was visible last.
+    seen_at: u64,
+}
+
+impl Turn {
+    fn all(&mut self) -> Share {
+        self.owed = 0;
+        Share { of: 1, rest: 0 }
+    }
+
+    fn next(&mut self, of: u32) -> Share {
+        self.owed -= 1;
+        self.last = (self.last + 1) % of;
+        Share {
+            of,
+            rest: self.last,
+        }
+    }
+}
+
 /// Some points of a slice, to be traced.
 struct Batch<'a> {
     slice: usize,
     points: Range<u32>,
     /// As many of the rays are to be known.
     rays: usize,
+    /// Which of the points.
+    share: Share,
     /// Their part of [`World::fixed`].
     fixed: &'a mut [u64],
     /// What they say.

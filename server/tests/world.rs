@@ -265,6 +265,37 @@ fn what_is_not_traced_again_could_not_have_changed() {
 }
 
 #[test]
+fn points_that_take_turns_are_all_up_to_date_after_as_many_steps() {
+    let in_turns = Options {
+        refresh_steps: 3,
+        ..options(256.0, 64)
+    };
+    let mut at_once = world(small_scene(), options(256.0, 64));
+    let mut in_turns = world(small_scene(), in_turns);
+    let mut rays = [0, 0];
+    for world in [&mut at_once, &mut in_turns] {
+        converge(world);
+    }
+    let (left, mut lagged) = (|[_, max]: [Vec3; 2]| max.x < 50.0, false);
+    for step in 1..=12 {
+        let time = f64::from(step) * 0.05;
+        // For a while, some are not seen; they miss no turn.
+        let some = |bounds: [Vec3; 2]| !(4..=6).contains(&step) || left(bounds);
+        for (world, rays) in [&mut at_once, &mut in_turns].into_iter().zip(&mut rays) {
+            *rays += world.step(time, &some, u64::MAX).rays;
+        }
+        lagged |= at_once.truth.cells != in_turns.truth.cells;
+    }
+    assert!(lagged && rays[1] * 2 < rays[0], "{rays:?}: none waited");
+    for _ in 0..2 {
+        assert!(in_turns.step(0.6, &all, u64::MAX).rays > 0);
+    }
+    at_once.step(0.6, &all, u64::MAX);
+    assert_same(&in_turns, &at_once);
+    assert_eq!(in_turns.step(0.6, &all, u64::MAX).rays, 0);
+}
+
+#[test]
 fn what_moved_out_of_view_is_up_to_date_when_it_is_seen_again() {
     let (scene, options) = (small_scene(), options(256.0, 64));
     let mut stepped = world(scene.clone(), options.clone());

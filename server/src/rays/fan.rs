@@ -2,8 +2,8 @@
 //!
 //! A point's rays share their origin, so what a triangle costs (its edges as seen from there) is
 //! paid once for all of them, and so is walking down a tree: a box is tested against the ball that
-//! the rays reach and the half space they go to, and at the leaves against cones around groups of
-//! neighbouring directions. What is left is a few multiplications a ray.
+//! the rays reach and the half space they go to, and at the leaves against what groups of
+//! neighbouring directions span. What is left is a few multiplications a ray.
 
 use glam::{Mat3A, Vec3, Vec3A};
 use obvhs::aabb::Aabb;
@@ -37,10 +37,6 @@ pub(super) struct Bundle {
     x: [[f32; LANES]; GROUPS],
     y: [[f32; LANES]; GROUPS],
     z: [[f32; LANES]; GROUPS],
-    /// A cone around each group: axis, and cosine and sine of the angle to its farthest direction.
-    axis: [[[f32; LANES]; ROWS]; 3],
-    cos: [[f32; LANES]; ROWS],
-    sin: [[f32; LANES]; ROWS],
 }
 
 impl Directions {
@@ -166,36 +162,14 @@ impl Bundle {
             x: [[0.0; LANES]; GROUPS],
             y: [[0.0; LANES]; GROUPS],
             z: [[0.0; LANES]; GROUPS],
-            axis: [[[0.0; LANES]; ROWS]; 3],
-            cos: [[1.0; LANES]; ROWS],
-            sin: [[0.0; LANES]; ROWS],
         };
         for (group, lanes) in part.chunks(LANES).enumerate() {
-            let mut sum = Vec3::ZERO;
             for (lane, index) in lanes.iter().enumerate() {
                 let d = directions[usize::from(*index)];
                 bundle.x[group][lane] = d.x;
                 bundle.y[group][lane] = d.y;
                 bundle.z[group][lane] = d.z;
-                sum += d;
             }
-            let axis = sum.try_normalize().unwrap_or(Vec3::Z);
-            let farthest = |cos: f32, index: &u16| {
-                let d = directions[usize::from(*index)];
-                if d == Vec3::ZERO {
-                    cos
-                } else {
-                    cos.min(d.dot(axis))
-                }
-            };
-            // A little wider: near 1, rounding in a cosine is a large angle.
-            let cos = (lanes.iter().fold(1.0, farthest) - 1e-6).max(-1.0);
-            let (row, lane) = (group / LANES, group % LANES);
-            for i in 0..3 {
-                bundle.axis[i][row][lane] = axis[i];
-            }
-            bundle.cos[row][lane] = cos;
-            bundle.sin[row][lane] = (1.0 - cos * cos).sqrt();
         }
         bundle
     }
@@ -250,18 +224,24 @@ pub(super) struct Rays<'a, L: Lanes> {
     open: [u8; GROUPS],
     /// Groups with such lanes.
     alive: u32,
-    /// Directions of these groups are ready.
-    ready: u32,
-    directions: [[L::F; 3]; GROUPS],
-    cones: Option<Cones<L>>,
+    packed: Option<Packed<L>>,
 }
 
-/// Inverses of the largest and least components of each group's directions along each axis, for
-/// the time when a ray enters and leaves a slab.
-struct Cones<L: Lanes> {
-    /// To enter a slab ahead, and one behind (towards negative coordinates).
+/// The open rays without gaps, in groups of their own.
+struct Packed<L: Lanes> {
+    /// In the tree's space.
+    directions: [[L::F; 3]; GROUPS],
+    /// Lanes that have not hit yet.
+    open: [u8; GROUPS],
+    /// Groups with such lanes.
+    alive: u32,
+    /// The group and lane that each lane was: eight times the one and the other.
+    from: [u8; BUNDLE],
+    /// Inverses of the largest and least components of each group's directions along each axis,
+    /// for the time when a ray enters a slab ahead, and one behind (towards negative
+    /// coordinates),
     enter: [[[L::F; ROWS]; 2]; 3],
-    /// To leave it.
+    /// and when it leaves it.
     leave: [[[L::F; ROWS]; 2]; 3],
 }
 
@@ -326,16 +306,17 @@ impl<'a, L: Lanes> Rays<'a, L> {
             normal,
             open,
             alive,
-            ready: 0,
-            directions: [[lanes.splat(0.0); 3]; GROUPS],
-            cones: None,
+            packed: None,
         }
     }
 
     /// All have hit something.
     #[inline(always)]
     pub(super) fn done(&self) -> bool {
-        self.alive == 0
+        self.packed
+            .as_ref()
+            .map_or(self.alive, |packed| packed.alive)
+            == 0
     }
 
     /// Sets the bits of the rays that have hit something.
@@ -363,42 +344,6 @@ impl<'a, L: Lanes> Rays<'a, L> {
         }
     }
 
-    /// Groups with open rays that may meet a box.
-    #[inline(always)]
-    fn towards(&mut self, bounds: &Aabb) -> u32 {
-        let (min, max) = (bounds.min - self.origin, bounds.max - self.origin);
-        let l = self.lanes;
-        let cones = match &mut self.cones {
-            Some(cones) => cones,
-            none => none.insert(Cones::new(l, self.bundle, self.axes, self.local_from_world)),
-        };
-        let mut enter = [(l.splat(0.0), &cones.enter[0][0]); 3];
-        let mut leave = [[(l.splat(0.0), &cones.leave[0][0]); 2]; 3];
-        for axis in 0..3 {
-            let (min, max) = (min[axis], max[axis]);
-            let side = &cones.enter[axis][usize::from(min <= 0.0)];
-            enter[axis] = (l.splat(min.max(-max).max(0.0)), side);
-            // Far enough from zero that times NEVER it is far.
-            let ahead = if max > 0.0 { max.max(1e-12) } else { NEVER };
-            let behind = if min < 0.0 { (-min).max(1e-12) } else { NEVER };
-            let [to_ahead, to_behind] = &cones.leave[axis];
-            leave[axis] = [(l.splat(ahead), to_ahead), (l.splat(behind), to_behind)];
-        }
-        let mut groups = 0;
-        let t_max = l.splat(self.t_max);
-        for row in 0..ROWS {
-            let (mut from, mut to) = (l.splat(0.0), t_max);
-            for axis in 0..3 {
-                let ((entry, enter), [ahead, behind]) = (enter[axis], leave[axis]);
-                from = l.max(from, l.mul(entry, enter[row]));
-                to = l.min(to, l.mul(ahead.0, ahead.1[row]));
-                to = l.min(to, l.mul(behind.0, behind.1[row]));
-            }
-            groups |= l.bits(l.ge(to, from)) << (row * LANES);
-        }
-        groups & self.alive
-    }
-
     /// Tests the triangles of a leaf against all open rays that may meet its box.
     #[inline(always)]
     pub(super) fn leaf<'b>(
@@ -407,7 +352,14 @@ impl<'a, L: Lanes> Rays<'a, L> {
         triangles: impl Iterator<Item = (&'b Corners, u32)>,
         solid: &impl Fn(u32, f32, f32) -> bool,
     ) {
-        let towards = self.towards(bounds);
+        if self.packed.is_none() {
+            self.packed = Some(self.pack());
+        }
+        let Some(packed) = &mut self.packed else {
+            return;
+        };
+        let (min, max) = (bounds.min - self.origin, bounds.max - self.origin);
+        let towards = packed.towards(self.lanes, min, max, self.t_max);
         if towards == 0 {
             return;
         }
@@ -415,11 +367,19 @@ impl<'a, L: Lanes> Rays<'a, L> {
             let Some(seen) = corners.seen_from(self.origin, self.normal, self.behind) else {
                 continue;
             };
-            let mut groups = towards & self.alive;
+            let mut groups = towards & packed.alive;
             while groups != 0 {
                 let group = groups.trailing_zeros() as usize;
                 groups &= groups - 1;
-                self.group(&seen, group, id, solid);
+                let hit = packed.hits(self.lanes, &seen, group, id, self.t_max, solid);
+                packed.open[group] &= !hit;
+                if packed.open[group] == 0 {
+                    packed.alive &= !(1 << group);
+                }
+                for lane in (0..LANES).filter(|lane| hit >> lane & 1 == 1) {
+                    let from = usize::from(packed.from[group * LANES + lane]);
+                    self.open[from / LANES] &= !(1 << (from % LANES));
+                }
             }
         }
     }
@@ -442,7 +402,7 @@ impl<'a, L: Lanes> Rays<'a, L> {
         while groups != 0 {
             let group = groups.trailing_zeros() as usize;
             groups &= groups - 1;
-            let directions = self.directions_of(group);
+            let directions = self.place(group);
             let squared = l.dot(directions, directions);
             let along = l.dot(to, directions);
             let inner = l.sub(l.mul(along, along), l.mul(squared, outside));
@@ -457,62 +417,159 @@ impl<'a, L: Lanes> Rays<'a, L> {
         }
     }
 
-    /// A group's directions in the tree's space.
+    /// A group's directions in the tree's space, by the same operations as [`Fan::direction`] and
+    /// a mover's matrix, so that a fan hits what its rays would hit one by one.
     #[inline(always)]
-    fn directions_of(&mut self, group: usize) -> [L::F; 3] {
-        if self.ready >> group & 1 == 0 {
-            self.ready |= 1 << group;
-            self.place(group);
+    fn place(&self, group: usize) -> [L::F; 3] {
+        let (l, bundle) = (self.lanes, self.bundle);
+        let (x, y, z) = (&bundle.x[group], &bundle.y[group], &bundle.z[group]);
+        let turned = turn(l, &self.axes, [l.load(x), l.load(y), l.load(z)]);
+        match &self.local_from_world {
+            Some(m) => turn(l, m, turned),
+            None => turned,
         }
-        self.directions[group]
     }
 
     #[inline(always)]
-    fn group(
-        &mut self,
+    fn pack(&self) -> Packed<L> {
+        let l = self.lanes;
+        let mut packed = Packed {
+            directions: [[l.splat(0.0); 3]; GROUPS],
+            open: [0; GROUPS],
+            alive: 0,
+            from: [0; BUNDLE],
+            enter: [[[l.splat(NEVER); ROWS]; 2]; 3],
+            leave: [[[l.splat(NEVER); ROWS]; 2]; 3],
+        };
+        // By axis, group and lane, and by axis, row, lane and group of the row.
+        let mut lanes = [[[0.0f32; LANES]; GROUPS]; 3];
+        let mut groups = [[[[0.0f32; LANES]; LANES]; ROWS]; 3];
+        let mut count = 0;
+        let mut put = |count: usize, axis: usize, value: f32| {
+            let (group, lane) = (count / LANES, count % LANES);
+            lanes[axis][group][lane] = value;
+            groups[axis][group / LANES][lane][group % LANES] = value;
+        };
+        let mut last = [0.0; 3];
+        for group in 0..GROUPS {
+            if self.open[group] == 0 {
+                continue;
+            }
+            let [x, y, z] = self.place(group);
+            let (x, y, z) = (l.store(x), l.store(y), l.store(z));
+            for lane in 0..LANES {
+                if self.open[group] >> lane & 1 == 1 {
+                    last = [x[lane], y[lane], z[lane]];
+                    put(count, 0, x[lane]);
+                    put(count, 1, y[lane]);
+                    put(count, 2, z[lane]);
+                    packed.from[count] = (group * LANES + lane) as u8;
+                    packed.open[count / LANES] |= 1 << (count % LANES);
+                    packed.alive |= 1 << (count / LANES);
+                    count += 1;
+                }
+            }
+        }
+        // Closed lanes of the last group are like another, so as not to widen what it spans.
+        for lane in count..count.next_multiple_of(LANES) {
+            for axis in 0..3 {
+                put(lane, axis, last[axis]);
+            }
+        }
+        for group in 0..count.div_ceil(LANES) {
+            let [x, y, z] = &lanes;
+            packed.directions[group] = [l.load(&x[group]), l.load(&y[group]), l.load(&z[group])];
+        }
+        let (zero, one, never) = (l.splat(0.0), l.splat(1.0), l.splat(NEVER));
+        // For rounding: longer times to leave, and shorter ones to enter.
+        let (wider, narrower) = (l.splat(1.0 + 1e-6), l.splat(1.0 - 1e-6));
+        for axis in 0..3 {
+            for row in 0..count.div_ceil(LANES).div_ceil(LANES) {
+                let own = &groups[axis][row];
+                let mut most = l.load(&own[0]);
+                let mut least = most;
+                for lane in 1..LANES {
+                    let component = l.load(&own[lane]);
+                    most = l.max(most, component);
+                    least = l.min(least, component);
+                }
+                let over_most = l.div(one, most);
+                let over_least = l.div(one, least);
+                let (down_most, down_least) = (l.sub(zero, over_most), l.sub(zero, over_least));
+                let (rises, falls) = (l.gt(most, zero), l.gt(zero, least));
+                let (all_rise, all_fall) = (l.gt(least, zero), l.gt(zero, most));
+                let [enter, leave] = [&mut packed.enter[axis], &mut packed.leave[axis]];
+                enter[0][row] = l.select(rises, l.mul(over_most, narrower), never);
+                enter[1][row] = l.select(falls, l.mul(down_least, narrower), never);
+                leave[0][row] = l.select(all_rise, l.mul(over_least, wider), never);
+                leave[1][row] = l.select(all_fall, l.mul(down_most, wider), never);
+            }
+        }
+        packed
+    }
+}
+
+impl<L: Lanes> Packed<L> {
+    /// Groups with open rays that may meet a box, given relative to the origin.
+    #[inline(always)]
+    fn towards(&self, l: L, min: Vec3A, max: Vec3A, t_max: f32) -> u32 {
+        let mut enter = [(l.splat(0.0), &self.enter[0][0]); 3];
+        let mut leave = [[(l.splat(0.0), &self.leave[0][0]); 2]; 3];
+        for axis in 0..3 {
+            let (min, max) = (min[axis], max[axis]);
+            let side = &self.enter[axis][usize::from(min <= 0.0)];
+            enter[axis] = (l.splat(min.max(-max).max(0.0)), side);
+            // Far enough from zero that times NEVER it is far.
+            let ahead = if max > 0.0 { max.max(1e-12) } else { NEVER };
+            let behind = if min < 0.0 { (-min).max(1e-12) } else { NEVER };
+            let [to_ahead, to_behind] = &self.leave[axis];
+            leave[axis] = [(l.splat(ahead), to_ahead), (l.splat(behind), to_behind)];
+        }
+        let mut groups = 0;
+        let t_max = l.splat(t_max);
+        let last = GROUPS - self.alive.leading_zeros() as usize;
+        for row in 0..last.div_ceil(LANES) {
+            let (mut from, mut to) = (l.splat(0.0), t_max);
+            for axis in 0..3 {
+                let ((entry, enter), [ahead, behind]) = (enter[axis], leave[axis]);
+                from = l.max(from, l.mul(entry, enter[row]));
+                to = l.min(to, l.mul(ahead.0, ahead.1[row]));
+                to = l.min(to, l.mul(behind.0, behind.1[row]));
+            }
+            groups |= l.bits(l.ge(to, from)) << (row * LANES);
+        }
+        groups & self.alive
+    }
+
+    /// Lanes of a group that are open and hit a triangle.
+    #[inline(always)]
+    fn hits(
+        &self,
+        l: L,
         seen: &Seen,
         group: usize,
         id: u32,
+        t_max: f32,
         solid: &impl Fn(u32, f32, f32) -> bool,
-    ) {
-        let directions = self.directions_of(group);
-        let (inside, sides) = seen.sides(self.lanes, directions);
+    ) -> u8 {
+        let directions = self.directions[group];
+        let (inside, [a, b, c]) = seen.sides(l, directions);
         let mut lanes = inside & u32::from(self.open[group]);
+        let mut hit = 0;
         if lanes == 0 {
-            return;
+            return hit;
         }
-        lanes &= seen.in_range(self.lanes, directions, self.t_max);
-        let [a, b, c] = sides;
-        let (a, b, c) = (
-            self.lanes.store(a),
-            self.lanes.store(b),
-            self.lanes.store(c),
-        );
+        lanes &= seen.in_range(l, directions, t_max);
+        let (a, b, c) = (l.store(a), l.store(b), l.store(c));
         while lanes != 0 {
             let lane = lanes.trailing_zeros() as usize;
             lanes &= lanes - 1;
             let sum = a[lane] + b[lane] + c[lane];
             if sum != 0.0 && solid(id, b[lane] / sum, c[lane] / sum) {
-                self.open[group] &= !(1 << lane);
+                hit |= 1 << lane;
             }
         }
-        if self.open[group] == 0 {
-            self.alive &= !(1 << group);
-        }
-    }
-
-    /// Makes a group's directions, by the same operations as [`Fan::direction`] and a mover's
-    /// matrix, so that a fan hits what its rays would hit one by one.
-    #[inline(always)]
-    fn place(&mut self, group: usize) {
-        let (l, bundle) = (self.lanes, self.bundle);
-        let (x, y, z) = (&bundle.x[group], &bundle.y[group], &bundle.z[group]);
-        let given = [l.load(x), l.load(y), l.load(z)];
-        let turned = turn(l, &self.axes, given);
-        self.directions[group] = match &self.local_from_world {
-            Some(m) => turn(l, m, turned),
-            None => turned,
-        };
+        hit
     }
 }
 
@@ -524,48 +581,4 @@ fn turn<L: Lanes>(l: L, by: &Mat3A, given: [L::F; 3]) -> [L::F; 3] {
         l.dot(l.splat3([x.y, y.y, z.y]), given),
         l.dot(l.splat3([x.z, y.z, z.z]), given),
     ]
-}
-
-impl<L: Lanes> Cones<L> {
-    #[inline(always)]
-    fn new(l: L, bundle: &Bundle, axes: Mat3A, local_from_world: Option<Mat3A>) -> Cones<L> {
-        let matrix = local_from_world.map_or(axes, |m| m * axes);
-        let rows = matrix.transpose();
-        let (zero, one, never) = (l.splat(0.0), l.splat(1.0), l.splat(NEVER));
-        let mut cones = Cones {
-            enter: [[[never; ROWS]; 2]; 3],
-            leave: [[[never; ROWS]; 2]; 3],
-        };
-        for (axis, of) in [rows.x_axis, rows.y_axis, rows.z_axis]
-            .into_iter()
-            .enumerate()
-        {
-            // A direction's component is its dot product with the matrix' row, whose angle to the
-            // cone's axis is known: the cone turns it by at most its own.
-            let squared = of.length_squared();
-            let length = l.splat(squared.sqrt());
-            let wider = l.splat(squared.sqrt() * 1e-5);
-            let (squared, of) = (l.splat(squared), l.splat3([of.x, of.y, of.z]));
-            for row in 0..ROWS {
-                let [x, y, z] = &bundle.axis;
-                let dot = l.dot(of, [l.load(&x[row]), l.load(&y[row]), l.load(&z[row])]);
-                let (cos, sin) = (l.load(&bundle.cos[row]), l.load(&bundle.sin[row]));
-                let across = l.sqrt(l.max(l.sub(squared, l.mul(dot, dot)), zero));
-                let (along, across) = (l.mul(dot, cos), l.mul(across, sin));
-                let limit = l.mul(length, cos);
-                let most = l.select(l.ge(dot, limit), length, l.add(along, across));
-                let down = l.sub(zero, dot);
-                let least = l.select(l.ge(down, limit), l.sub(zero, length), l.sub(along, across));
-                let (most, least) = (l.add(most, wider), l.sub(least, wider));
-                let (over_most, over_least) = (l.div(one, most), l.div(one, least));
-                let [enter, leave] = [&mut cones.enter[axis], &mut cones.leave[axis]];
-                let (up, down) = (l.gt(most, zero), l.gt(zero, least));
-                enter[0][row] = l.select(up, over_most, never);
-                enter[1][row] = l.select(down, l.sub(zero, over_least), never);
-                leave[0][row] = l.select(l.gt(least, zero), over_least, never);
-                leave[1][row] = l.select(l.gt(zero, most), l.sub(zero, over_most), never);
-            }
-        }
-        cones
-    }
 }

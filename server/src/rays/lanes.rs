@@ -19,7 +19,6 @@ pub(super) trait Lanes: Copy {
     fn div(self, a: Self::F, b: Self::F) -> Self::F;
     fn min(self, a: Self::F, b: Self::F) -> Self::F;
     fn max(self, a: Self::F, b: Self::F) -> Self::F;
-    fn sqrt(self, a: Self::F) -> Self::F;
     /// a >= b, which is false for what is not a number.
     fn ge(self, a: Self::F, b: Self::F) -> Self::M;
     /// a > b.
@@ -99,10 +98,6 @@ impl Lanes for Plain {
         zip(a, b, |a, b| if a > b { a } else { b })
     }
     #[inline(always)]
-    fn sqrt(self, a: Self::F) -> Self::F {
-        a.map(f32::sqrt)
-    }
-    #[inline(always)]
     fn ge(self, a: Self::F, b: Self::F) -> u32 {
         compare(a, b, |a, b| a >= b)
     }
@@ -175,10 +170,6 @@ impl Lanes for pulp::x86::V3 {
     #[inline(always)]
     fn max(self, a: Self::F, b: Self::F) -> Self::F {
         self.avx._mm256_max_ps(a, b)
-    }
-    #[inline(always)]
-    fn sqrt(self, a: Self::F) -> Self::F {
-        self.avx._mm256_sqrt_ps(a)
     }
     #[inline(always)]
     fn ge(self, a: Self::F, b: Self::F) -> Self::M {

@@ -858,3 +858,116 @@ fn wrap_modes_choose_the_texel_that_a_texture_would() {
         assert!(nearest_texel(f32::NAN, 4, wrap) < 4);
     }
 }
+
+/// What a fan hits, and what its rays hit one by one, in the sorted order.
+fn both_ways(tracer: &CpuTracer, against: Against, fan: &Fan<'_>, t_max: f32) -> [Vec<u64>; 2] {
+    let rays: Vec<Vec3> = (0..fan.directions.len())
+        .map(|i| fan.direction(i))
+        .collect();
+    let words = fan.directions.words();
+    let (mut together, mut single) = (vec![0; words], vec![0; words]);
+    let todo = vec![!0; words];
+    tracer.occluded_fan(against, fan, t_max, &todo, &mut together);
+    tracer.occluded(against, fan.origin, &rays, t_max, &todo, &mut single);
+    [together, single]
+}
+
+#[test]
+fn a_fan_hits_exactly_what_its_rays_hit_one_by_one() {
+    let (scene, pose, deformed, moves) = mixture();
+    let tracer = CpuTracer::new(&scene, &pose, &deformed, &moves).unwrap();
+    let mut random = Random(12);
+    // Fewer than a group, an odd number, one bundle, and several.
+    for rays in [3, 64, 200, 256, 1000] {
+        let samples = Samples::new(rays);
+        let (mut hits, mut misses) = (0, 0);
+        for point in 0..150 {
+            let (origin, normal) = (random.cube() * 2.0, random.direction());
+            let fan = samples.fan(point, origin, normal, random.direction());
+            let t_max = 0.05 + random.unit() * 1.5;
+            let instance = (random.unit() * 12.0) as u32;
+            for against in [
+                Against::All,
+                Against::Static,
+                Against::Movers,
+                Against::Instance(instance),
+                Against::AllExcept(instance),
+            ] {
+                let [together, single] = both_ways(&tracer, against, &fan, t_max);
+                assert_eq!(together, single, "{against:?} {origin} {normal} {t_max}");
+                let hit = single.iter().map(|word| word.count_ones()).sum::<u32>() as usize;
+                hits += hit;
+                misses += rays - hit;
+            }
+        }
+        assert!(hits > 10 * rays && misses > 10 * rays, "{hits} {misses}");
+    }
+}
+
+#[test]
+fn directions_that_go_anywhere_make_fans_too() {
+    let (scene, pose, deformed, moves) = mixture();
+    let tracer = CpuTracer::new(&scene, &pose, &deformed, &moves).unwrap();
+    let mut random = Random(13);
+    for _ in 0..50 {
+        let mut given: Vec<Vec3> = (0..100).map(|_| random.direction()).collect();
+        given.extend([Vec3::ZERO, Vec3::NAN, Vec3::X, Vec3::NEG_Y, -Vec3::Z]);
+        let directions = Directions::new(&given);
+        let fan = Fan {
+            origin: random.cube() * 1.5,
+            axes: Mat3A::IDENTITY,
+            directions: &directions,
+        };
+        let [together, single] = both_ways(&tracer, Against::All, &fan, 1.0);
+        assert_eq!(together, single, "from {}", fan.origin);
+    }
+}
+
+#[test]
+fn cores_and_vectors_decide_no_ray_otherwise() {
+    // A closed ball of many corners, stretched, turned and sheared, from outside and within; and
+    // the same without a triangle, which has no core.
+    let ball = |u: f32, v: f32| {
+        let (u, v) = (u * std::f32::consts::TAU, v * std::f32::consts::PI);
+        let u = if u == std::f32::consts::TAU { 0.0 } else { u };
+        let sin = if v == std::f32::consts::PI {
+            0.0
+        } else {
+            v.sin()
+        };
+        vec3(u.cos() * sin, u.sin() * sin, v.cos()) * 0.5
+    };
+    let mut random = Random(14);
+    let mut closed = tessellated(&mut random, 16, ball);
+    for y in 0..=16 {
+        closed.positions[y * 17 + 16] = closed.positions[y * 17];
+    }
+    let mut open = closed.clone();
+    open.triangles.swap_remove(200);
+    let samples = Samples::new(256);
+    for (mesh, has_core) in [(closed, true), (open, false)] {
+        for placed in matrices(&mut random) {
+            let (mut scene, mut pose) = (Scene::default(), Pose::default());
+            scene.meshes.push(mesh.clone());
+            place(&mut scene, &mut pose, 0, placed, false);
+            let mut tracer = CpuTracer::new(&scene, &pose, &[], &[true]).unwrap();
+            assert_eq!(tracer.meshes[0].core.is_some(), has_core);
+            let mut hits = 0;
+            for point in 0..200 {
+                let origin = placed.transform_point3(random.cube() * 1.2);
+                let fan = samples.fan(point, origin, random.direction(), Vec3::X);
+                let [together, single] = both_ways(&tracer, Against::All, &fan, 0.6);
+                assert_eq!(together, single, "from {origin}");
+                hits += single.iter().map(|word| word.count_ones()).sum::<u32>();
+                #[cfg(target_arch = "x86_64")]
+                {
+                    let avx = tracer.avx.take();
+                    let [plain, _] = both_ways(&tracer, Against::All, &fan, 0.6);
+                    assert_eq!(plain, single, "without vectors, from {origin}");
+                    tracer.avx = avx;
+                }
+            }
+            assert!(hits > 500, "{hits} hits: too few to tell");
+        }
+    }
+}
