@@ -166,7 +166,7 @@ impl Item<'_> {
 
 /// Bytes of the set of blocks of so many points.
 fn shown_bytes(points: u32) -> usize {
-    points.div_ceil(8 * BLOCK as u32).min(8) as usize
+    points.div_ceil(BLOCK as u32).div_ceil(8).min(8) as usize
 }
 
 fn read_shown(r: &mut Reader<'_>, slice: &Slice) -> Result<u64, StreamError> {
@@ -357,10 +357,11 @@ impl Slices<'_> {
             return Err(StreamError::Value);
         };
         for ((value, before), place) in values.iter().zip(before).zip(places) {
-            if value != before && *place != NOWHERE {
-                if let Some(point) = mirror.point(*place) {
-                    mirror.set_point(*place, point.with_occlusion(*value));
-                }
+            if value != before
+                && *place != NOWHERE
+                && let Some(point) = mirror.point(*place)
+            {
+                mirror.set_point(*place, point.with_occlusion(*value));
             }
         }
         if shown == slice.shown {
