@@ -4,8 +4,9 @@
 mod small_scene;
 
 use glam::{DAffine3, DVec3, Vec3};
+use psao_core::residual::Quantiser;
 use psao_core::{Bucket, Cell, Kernel};
-use psao_server::encode::{Compression, Encoder, Scheme};
+use psao_server::encode::{Compression, Encoder, Limits, Scheme, View};
 use psao_server::points::PointError;
 use psao_server::scene::Scene;
 use psao_server::world::{Options, World, WorldError};
@@ -18,6 +19,28 @@ fn cells(threshold: u8) -> Scheme {
         compression: Compression::Fast,
     }
 }
+
+fn residual() -> Scheme {
+    let quantiser = Quantiser {
+        step: 3,
+        dead_zone: 2,
+    };
+    Scheme::Residual(quantiser, Limits::default())
+}
+
+/// As a scheme needs it.
+fn laid_out(options: Options, scheme: Scheme) -> Options {
+    Options {
+        rest_space: matches!(scheme, Scheme::Residual(..)),
+        ..options
+    }
+}
+
+/// Everything, from nowhere in particular.
+const VIEW: View<'static> = View {
+    sees: &all,
+    eye: None,
+};
 
 fn options(density: f64, rays: usize) -> Options {
     Options {
@@ -167,52 +190,54 @@ fn assert_sound(world: &World) {
 
 #[test]
 fn points_truth_and_stream_are_the_same_on_any_number_of_threads() {
-    let run = |scene: Scene, threads: usize| -> (Vec<Bucket>, Vec<Cell>, Vec<u8>) {
+    let run = |scene: Scene, scheme: Scheme, threads: usize| -> (Vec<Bucket>, Vec<Cell>, Vec<u8>) {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads);
         pool.build().unwrap().install(|| {
-            let mut world = world(scene, options(64.0, 64));
+            let mut world = world(scene, laid_out(options(64.0, 64), scheme));
             converge(&mut world);
-            let mut encoder = Encoder::new(&world, cells(2));
+            let mut encoder = Encoder::new(&world, scheme, 0);
             let mut bytes = encoder.header(&world, world.scene.hash(), 30.0);
             for frame in 0..4 {
                 world.step(f64::from(frame) * 0.1, &all, u64::MAX);
-                encoder.merge(&world.truth);
-                world.truth.clear_changes();
-                encoder.frame(&world, 0, &all, true, &mut bytes);
+                encoder.merge(&world);
+                world.clear_changes();
+                encoder.frame(&world, 0, &VIEW, true, &mut bytes);
             }
-            (world.truth.buckets, world.truth.cells, bytes)
+            let mirror = encoder.mirror();
+            (mirror.buckets().to_vec(), mirror.cells().to_vec(), bytes)
         })
     };
     for scene in [small_scene(), Scene::atrium()] {
-        let once = run(scene.clone(), 2);
-        assert!(once == run(scene.clone(), 2), "{}: twice", scene.name);
-        assert!(
-            once == run(scene.clone(), 1),
-            "{}: 1 and 2 threads",
-            scene.name
-        );
+        for scheme in [cells(2), residual()] {
+            let name = format!("{} {scheme:?}", scene.name);
+            let once = run(scene.clone(), scheme, 2);
+            assert!(once == run(scene.clone(), scheme, 2), "{name}: twice");
+            assert!(once == run(scene.clone(), scheme, 1), "{name}: 1 thread");
+        }
     }
 }
 
 #[test]
 fn a_still_scene_costs_no_ray_and_no_byte_once_it_has_converged() {
-    let mut world = world(still_scene(), options(256.0, 64));
-    let mut encoder = Encoder::new(&world, cells(0));
-    let (mut rays, mut bytes) = (Vec::new(), Vec::new());
-    for frame in 0..6 {
-        let step = world.step(f64::from(frame), &all, u64::MAX);
-        encoder.merge(&world.truth);
-        world.truth.clear_changes();
-        let mut stream = Vec::new();
-        let stats = encoder.frame(&world, 0, &all, false, &mut stream);
-        assert_eq!(stats.bytes, stream.len() as u64);
-        assert!(step.rays_if_all > 0);
-        rays.push(step.rays);
-        bytes.push(stats.bytes);
+    for scheme in [cells(0), residual()] {
+        let mut world = world(still_scene(), laid_out(options(256.0, 64), scheme));
+        let mut encoder = Encoder::new(&world, scheme, 0);
+        let (mut rays, mut bytes) = (Vec::new(), Vec::new());
+        for frame in 0..6 {
+            let step = world.step(f64::from(frame), &all, u64::MAX);
+            encoder.merge(&world);
+            world.clear_changes();
+            let mut stream = Vec::new();
+            let stats = encoder.frame(&world, 0, &VIEW, false, &mut stream);
+            assert_eq!(stats.bytes, stream.len() as u64);
+            assert!(step.rays_if_all > 0);
+            rays.push(step.rays);
+            bytes.push(stats.bytes);
+        }
+        assert!(rays[0] > 0 && bytes[0] > 0);
+        assert_eq!(rays[1..], [0; 5]);
+        assert_eq!(bytes[1..], [0; 5]);
     }
-    assert!(rays[0] > 0 && bytes[0] > 0);
-    assert_eq!(rays[1..], [0; 5]);
-    assert_eq!(bytes[1..], [0; 5]);
 }
 
 #[test]
