@@ -237,15 +237,16 @@ impl Encoder {
                 frame.packets
             }
         };
-        if packets.is_empty() {
-            if !always && !self.snapshot && out.len() == start {
-                return stats;
-            }
+        let wanted = always || self.snapshot || out.len() > start;
+        if packets.is_empty() && wanted {
             packets.push((kind::FRAME, 0, Vec::new()));
         }
-        self.frame_id += 1;
-        self.write_frame(&packets, time_ns, out);
+        if !packets.is_empty() {
+            self.frame_id += 1;
+            self.write_frame(&packets, time_ns, out);
+        }
         stats.bytes = (out.len() - start) as u64;
+        // Frames that send nothing pay for those that sent too much.
         if let Sent::Residual(sent) = &mut self.sent {
             sent.spent(stats.bytes);
         }

@@ -74,6 +74,9 @@ pub struct Residual {
     /// Slices on their way from one level's picture to another's.
     fades: BTreeMap<u32, Fade>,
     space: Space,
+    /// Where there are too few cells for all slices: how many each open one takes at most, so that
+    /// none finds them used up, however many of its blocks are shown.
+    cells: Option<Vec<u32>>,
     /// Bytes sent beyond the budget so far.
     debt: f64,
 }
@@ -115,6 +118,7 @@ impl Residual {
         let limit = |all: u32, limit: u32| if limit == 0 { all } else { all.min(limit) };
         capacity.points = limit(capacity.points, limits.points);
         capacity.cells = limit(capacity.cells, limits.cells);
+        let scarce = capacity.cells < capacity_of(world).cells;
         let mut heap = SliceHeap::new(capacity);
         for patch in 0..world.topology.patches() {
             // The encoder's own copy is whole from the start.
@@ -138,6 +142,7 @@ impl Residual {
             frames: 1,
             fades: BTreeMap::new(),
             space: Space::new(capacity.points),
+            cells: scarce.then(|| vec![0; world.slices.len()]),
             debt: 0.0,
         }
     }
@@ -172,6 +177,9 @@ impl Residual {
         self.heap.slices().reset(self.capacity.cells);
         self.fades.clear();
         self.space = Space::new(self.capacity.points);
+        if let Some(cells) = &mut self.cells {
+            cells.fill(0);
+        }
     }
 
     pub fn merge(&mut self, world: &World) {
@@ -441,15 +449,23 @@ impl Residual {
     }
 
     fn close(&mut self, index: u32, out: &mut Frame) {
+        self.give_back(index);
+        self.due[index as usize] = true;
+        out.closes.push(index);
+    }
+
+    /// Undoes [`Residual::open`].
+    fn give_back(&mut self, index: u32) {
         let slice = self.heap.get()[index as usize];
         let first = slice.point_first;
         self.space.free(first..first + slice.point_count);
+        if let Some(cells) = &mut self.cells {
+            cells[index as usize] = 0;
+        }
         let mut slices = self.heap.slices();
         slices
             .close(&mut self.mirror, index)
             .expect("open slices close");
-        self.due[index as usize] = true;
-        out.closes.push(index);
     }
 
     /// What a slice's points should say at the client now.
@@ -500,7 +516,7 @@ impl Residual {
             if *room <= 0.0 {
                 stats.waiting += 1;
                 if coded.opens.is_some() {
-                    self.forget(coded.index);
+                    self.give_back(coded.index);
                 }
                 continue;
             }
@@ -557,17 +573,20 @@ impl Residual {
     /// yet. Returns what the item says of it, if there is room.
     fn open(&mut self, world: &World, index: u32, out: &mut Frame) -> Option<[u32; 3]> {
         let slice = &world.slices[index as usize];
-        let level = self.mirror.instances()[slice.instance as usize].level;
-        let has = world
-            .levels(slice)
-            .iter()
-            .filter(|has| u32::from(**has) >= level);
-        let count = has.count() as u32;
+        let grid = self.mirror.instances()[slice.instance as usize];
+        let points = || world.topology.points_of(slice.patch, grid.level);
+        let count = points().count() as u32;
+        if count == 0 {
+            return None;
+        }
+        let own_cells = self.cells.as_ref().map_or(0, |_| {
+            let bins = points().filter_map(|point| Bin::of(&grid, point));
+            bins.map(|bin| bin.cell).collect::<HashSet<_>>().len() as u32
+        });
         let first = loop {
-            let cells_free = self.limits.cells == 0 || self.free_cells() >= count;
-            if count == 0 {
-                return None;
-            }
+            let taken: u32 = self.cells.iter().flatten().sum();
+            // Cell 0 is never used.
+            let cells_free = own_cells == 0 || taken + own_cells < self.capacity.cells;
             if cells_free && let Some(first) = self.space.take(count) {
                 break first;
             }
@@ -578,29 +597,15 @@ impl Residual {
             let oldest = idle.min_by_key(|&other| self.seen[other as usize])?;
             self.close(oldest, out);
         };
+        if let Some(cells) = &mut self.cells {
+            cells[index as usize] = own_cells;
+        }
         let mut slices = self.heap.slices();
         let opens = [slice.instance, slice.patch, first];
         slices
             .open(&self.mirror, index, opens)
             .expect("own slices open");
         Some(opens)
-    }
-
-    /// Undoes [`Residual::open`].
-    fn forget(&mut self, index: u32) {
-        let slice = self.heap.get()[index as usize];
-        self.space
-            .free(slice.point_first..slice.point_first + slice.point_count);
-        let mut slices = self.heap.slices();
-        slices
-            .close(&mut self.mirror, index)
-            .expect("open slices close");
-    }
-
-    fn free_cells(&mut self) -> u32 {
-        let free = self.heap.slices().free;
-        let words = (self.capacity.cells as usize).div_ceil(64);
-        free[..words].iter().map(|word| word.count_ones()).sum()
     }
 
     fn code(&self, world: &World, index: u32, opens: Option<[u32; 3]>) -> Coded {
