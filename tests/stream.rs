@@ -3380,6 +3380,10 @@ fn uplink_packets() -> Vec<Vec<u8>> {
         }),
         packet(uplink::kind::ACK, &|w| w.u32(77)),
         packet(uplink::kind::RESYNC, &|_| Ok(())),
+        packet(uplink::kind::PRESENCE, &|w| {
+            let (instance, present) = (5, false);
+            uplink::Presence { instance, present }.write(w)
+        }),
     ]
 }
 
@@ -3409,6 +3413,9 @@ fn rewrite(message: &Message<'_>) -> Vec<u8> {
         }
         Message::Ack(id) => write_packet(&mut bytes, uplink::kind::ACK, 0, 5, |w| w.u32(*id)),
         Message::Resync => write_packet(&mut bytes, uplink::kind::RESYNC, 0, 5, |_| Ok(())),
+        Message::Presence(m) => {
+            write_packet(&mut bytes, uplink::kind::PRESENCE, 0, 5, |w| m.write(w))
+        }
     };
     bytes.truncate(length.unwrap());
     bytes
