@@ -3473,8 +3473,8 @@ fn uplink_bodies_of_the_wrong_length_or_with_reserved_flags_are_refused() {
             assert_eq!(read_uplink(&flagged), Err(StreamError::Value));
         }
     }
-    let unknown = |flags| with_body(&[70, flags], b"later");
-    assert_eq!(read_uplink(&unknown(0)), Err(StreamError::Kind(70)));
+    let unknown = |flags| with_body(&[71, flags], b"later");
+    assert_eq!(read_uplink(&unknown(0)), Err(StreamError::Kind(71)));
     assert_eq!(read_uplink(&unknown(flag::OPTIONAL)), Ok(None));
 }
 
