@@ -1816,94 +1816,86 @@ const SLICES: u8 = kind::SLICES;
 fn items_that_do_not_fit_are_refused() {
     // [15.2, 15.5, 15.8]
     let header = slices_header();
-    let outcome = |lists: &[&[Made]]| {
-        let parts: Vec<_> = lists.iter().map(|list| (SLICES, items(list))).collect();
+    // A packet each.
+    let outcome = |list: &[&Made]| {
+        let part = |item: &&Made| (SLICES, items(std::slice::from_ref(*item)));
+        let parts: Vec<_> = list.iter().map(part).collect();
         slices_outcome(&header, &parts)
     };
-    let good = |lists: &[&[Made]]| {
-        let outcome = outcome(lists);
+    let good = |list: &[&Made]| {
+        let outcome = outcome(list);
         assert_eq!(outcome.error, None, "{:?}", outcome.clause);
     };
-    let refused = |lists: &[&[Made]], clause: &str| {
-        let outcome = outcome(lists);
+    let refused = |list: &[&Made], clause: &str| {
+        let outcome = outcome(list);
         assert!(matches!(outcome.error, Some(ClientError::Stream(_))));
         assert_eq!(outcome.clause.unwrap(), clause);
     };
     let [a, b, c] = SLICES_POINTS;
     let first = open_item(0, [0, 0, 0], 3, a);
-    good(&[&[first.clone()]]);
-    good(&[&[open_item(2, [0, 2, 60 - c], 1, c)]]);
-    good(&[&[open_item(1, [2, 2, 0], 0, c)]]);
+    good(&[&first]);
+    good(&[&open_item(2, [0, 2, 60 - c], 1, c)]);
+    good(&[&open_item(1, [2, 2, 0], 0, c)]);
     let of_level = a - a.div_ceil(4);
-    good(&[&[open_item(1, [2, 0, 7], 1, of_level)]]);
+    good(&[&open_item(1, [2, 0, 7], 1, of_level)]);
 
     // What is open, and what is not.
     let update = |index| (index, Operation::Update, a, still(a, false));
     let show = |index, shown| (index, Operation::Show(shown), a, still(a, false));
     let close = |index| (index, Operation::Close, 0, Vec::new());
     for later in [update(0), show(0, 1), close(0)] {
-        good(&[&[first.clone()], &[later.clone()]]);
-        refused(&[&[later.clone()]], "15.5: open, or not open");
-        refused(
-            &[&[first.clone()], &[close(0)], &[later]],
-            "15.5: open, or not open",
-        );
+        good(&[&first, &later]);
+        refused(&[&later], "15.5: open, or not open");
+        refused(&[&first, &close(0), &later], "15.5: open, or not open");
     }
-    good(&[&[first.clone()], &[close(0)], &[first.clone()]]);
-    refused(
-        &[&[first.clone()], &[first.clone()]],
-        "15.5: open, or not open",
-    );
+    good(&[&first, &close(0), &first]);
+    refused(&[&first, &first], "15.5: open, or not open");
     for far in [
         update(3),
         show(3, 1),
         close(3),
         open_item(3, [0, 0, 0], 3, a),
     ] {
-        refused(&[&[far]], "15.5: index");
+        refused(&[&far], "15.5: index");
     }
 
     // Instances and patches.
     let opens = |at| open_item(0, at, 0, a);
     for instance in [3, u32::MAX] {
-        refused(&[&[opens([instance, 0, 0])]], "15.5: instance");
+        refused(&[&opens([instance, 0, 0])], "15.5: instance");
     }
-    refused(&[&[opens([1, 0, 0])]], "15.5: instance");
+    refused(&[&opens([1, 0, 0])], "15.5: instance");
     for patch in [3, 4, u32::MAX] {
-        refused(&[&[opens([0, patch, 0])]], "15.5: no such patch");
+        refused(&[&opens([0, patch, 0])], "15.5: no such patch");
     }
-    refused(&[&[opens([2, 1, 0])]], "15.5: no points of the level");
+    refused(&[&opens([2, 1, 0])], "15.5: no points of the level");
 
     // Where the points are kept.
     let second = |at, first, points| open_item(at, [0, 1, first], 1, points);
     for first in [61 - a, 60, 61, u32::MAX, u32::MAX - a + 1] {
-        refused(&[&[opens([0, 0, first])]], "15.5: beyond the points");
+        refused(&[&opens([0, 0, first])], "15.5: beyond the points");
     }
     for first_point in [0, 1, 7, a - 1] {
-        let both = [first.clone(), second(1, first_point, b)];
-        refused(&[&both], "15.5: points of another slice");
+        let both = [&first, &second(1, first_point, b)];
+        refused(&both, "15.5: points of another slice");
     }
-    good(&[&[first.clone(), second(1, a, b)]]);
-    let after = open_item(0, [0, 0, b], 3, a);
-    good(&[&[second(0, 0, b), (1, after.1, a, after.3.clone())]]);
-    let after = open_item(1, [0, 0, b - 1], 3, a);
+    good(&[&first, &second(1, a, b)]);
+    good(&[&second(0, 0, b), &open_item(1, [0, 0, b], 3, a)]);
+    let overlaps = open_item(1, [0, 0, b - 1], 3, a);
     refused(
-        &[&[second(0, 0, b), after]],
+        &[&second(0, 0, b), &overlaps],
         "15.5: points of another slice",
     );
-    good(&[&[first.clone()], &[close(0)], &[second(1, 7, b)]]);
+    good(&[&first, &close(0), &second(1, 7, b)]);
 
     // Bits without a block.
-    good(&[&[first.clone()], &[show(0, 0)]]);
+    good(&[&first, &show(0, 0)]);
     for shown in [4, 0x80, 0x83] {
         refused(
-            &[&[open_item(0, [0, 0, 0], shown, a)]],
+            &[&open_item(0, [0, 0, 0], shown, a)],
             "15.8: a bit without a block",
         );
-        refused(
-            &[&[first.clone()], &[show(0, shown)]],
-            "15.8: a bit without a block",
-        );
+        refused(&[&first, &show(0, shown)], "15.8: a bit without a block");
     }
 }
 
@@ -2067,22 +2059,17 @@ fn instances_change_only_while_none_of_their_slices_is_open_and_alone() {
     let header = slices_header();
     let outcome = |parts: &[(u8, Vec<u8>)]| slices_outcome(&header, parts);
     let frame = |instances: &[(u32, Instance)]| (kind::FRAME, content(instances, &[], &[]));
-    let slices = |list: &[Made]| (SLICES, items(list));
+    let slices = |item: &Made| (SLICES, items(std::slice::from_ref(item)));
     let [(_, all), (_, coarse)] = slices_instances();
     let opened = open_item(1, [0, 0, 0], 3, SLICES_POINTS[0]);
     let closed = (1, Operation::Close, 0, Vec::new());
     let clause = "6: an instance with an open slice";
     for changed in [all, coarse, Instance::default()] {
-        let parts = [slices(&[opened.clone()]), frame(&[(0, changed)])];
+        let parts = [slices(&opened), frame(&[(0, changed)])];
         assert_eq!(outcome(&parts).clause.unwrap(), clause);
-        let parts = [slices(&[opened.clone()]), frame(&[(1, all), (2, changed)])];
+        let parts = [slices(&opened), frame(&[(1, all), (2, changed)])];
         assert_eq!(outcome(&parts).error, None);
-        let open_and_closed = slices(&[opened.clone()]);
-        let parts = [
-            open_and_closed,
-            slices(&[closed.clone()]),
-            frame(&[(0, changed)]),
-        ];
+        let parts = [slices(&opened), slices(&closed), frame(&[(0, changed)])];
         assert_eq!(outcome(&parts).error, None);
     }
     for level in 0..6 {
