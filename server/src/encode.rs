@@ -111,7 +111,7 @@ pub struct Encoder {
 
 /// What the client has.
 enum Sent {
-    Cells(cells::Cells),
+    Cells(Box<cells::Cells>),
     Residual(Box<residual::Residual>),
 }
 
@@ -133,12 +133,12 @@ impl Encoder {
                 compression,
             } => {
                 let capacity = capacity_of(world);
-                Sent::Cells(cells::Cells::new(
+                Sent::Cells(Box::new(cells::Cells::new(
                     &world.truth,
                     capacity,
                     threshold,
                     compression,
-                ))
+                )))
             }
             Scheme::Residual(quantiser, limits) => {
                 let had = topology_hash != 0 && topology_hash == world.topology.hash;
