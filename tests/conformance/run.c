@@ -6,10 +6,11 @@
  *
  * CLAUSES: of docs/format.md. BEFORE: the stream that the client got before this one, whatever came
  * of it, and was then restarted.
- * FRAMES: complete frames with the right hash. RESYNCS: those with a wrong one. DIGEST: FNV-1a, eight bytes at a time, over the
- * three buffers of each of these frames. RESULT: the psao_result that ends it. A valid stream's
- * NAME.lookups holds lines of an instance, a position, a normal and the openness after its last
- * frame, which may be off by 1/255. Each stream is pushed whole, in pieces, and byte by byte.
+ * FRAMES: complete frames with the right hash. RESYNCS: those with a wrong one. DIGEST: FNV-1a,
+ * eight bytes at a time, over the three buffers of each of the complete ones. RESULT: the
+ * psao_result that ends it. A valid stream's NAME.lookups holds lines of an instance, a position, a
+ * normal and the openness after its last frame, which may be off by 1/255. Each stream is pushed
+ * whole, in pieces, and byte by byte.
  *
  *     run FOLDER
  */
