@@ -293,8 +293,8 @@ typedef struct psao_instance {
   uint32_t bucket_count;
   /* Takes a local normal to cell space, before normalising. */
   float normal_scale[3];
-  /* Zero. */
-  uint32_t reserved;
+  /* Level of detail, 0 (all points) to 3. For people: the lookup does not need it. */
+  uint32_t level;
 } psao_instance;
 
 /* Up to eight cells by their index; 0 ends the list. */
@@ -630,6 +630,22 @@ psao_result psao_uplink_joints(struct psao_uplink *uplink,
                                uint8_t *out,
                                size_t capacity_bytes,
                                size_t *out_bytes);
+
+/* Writes that you took an instance out of the scene, or put it back: what is out has no points
+ * and occludes nothing. All are in at first. To swap an instance's mesh, have an instance for
+ * each mesh, and put one of them in.
+ *
+ * present: 1 if it is in the scene, 0 if it is not.
+ *
+ * PSAO_ERROR_VALUE: present is neither.
+ *
+ * out, capacity_bytes, out_bytes, Threads and the rest as psao_uplink_hello. Since ABI 1. */
+psao_result psao_uplink_presence(struct psao_uplink *uplink,
+                                 uint32_t instance_index,
+                                 uint32_t present,
+                                 uint8_t *out,
+                                 size_t capacity_bytes,
+                                 size_t *out_bytes);
 
 /* Writes that a frame is in your mirror. Optional; a later one makes up for one that is lost.
  *

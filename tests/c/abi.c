@@ -10,7 +10,7 @@ static void check_layout(void) {
     CHECK(offsetof(psao_instance, cells_per_unit) == 16);
     CHECK(offsetof(psao_instance, bucket_first) == 28 && offsetof(psao_instance, dims) == 32);
     CHECK(offsetof(psao_instance, bucket_count) == 44);
-    CHECK(offsetof(psao_instance, normal_scale) == 48);
+    CHECK(offsetof(psao_instance, normal_scale) == 48 && offsetof(psao_instance, level) == 60);
     CHECK(sizeof(psao_bucket) == 32 && sizeof(psao_cell) == 32 && offsetof(psao_cell, points) == 4);
     CHECK(sizeof(psao_range) == 8 && sizeof(psao_uplink) == 4);
     CHECK(sizeof(psao_camera) == 64 && offsetof(psao_camera, position_m) == 16);
@@ -325,13 +325,18 @@ static void check_uplink(bytes stream) {
     CHECK(out[0] == 68 && length == 20 && sequence_of(out) == 5);
     GIVES(PSAO_OK, psao_uplink_resync(&uplink, out, 16, &length));
     CHECK(out[0] == 69 && length == 16);
+    GIVES(PSAO_ERROR_VALUE, psao_uplink_presence(&uplink, 3, 2, out, room, &length));
+    GIVES(PSAO_OK, psao_uplink_presence(&uplink, 3, 1, out, room, &length));
+    CHECK(out[0] == 70 && length == 24 && out[16] == 3 && out[20] == 1 && out[21] == 0);
+    GIVES(PSAO_OK, psao_uplink_presence(&uplink, 3, 0, out, room, &length));
+    CHECK(out[20] == 0);
     GIVES(PSAO_ERROR_OUTPUT_SIZE, psao_uplink_resync(&uplink, out, 15, &length));
     GIVES(PSAO_ERROR_NULL, psao_uplink_resync(NULL, out, room, &length));
     GIVES(PSAO_ERROR_NULL, psao_uplink_resync(&uplink, NULL, room, &length));
     GIVES(PSAO_ERROR_NULL, psao_uplink_resync(&uplink, out, room, NULL));
     GIVES(PSAO_ERROR_NULL, psao_uplink_hello(NULL, &config, token, 5, 0, out, room, &length));
     GIVES(PSAO_ERROR_NULL, psao_uplink_hello(&uplink, &config, NULL, 5, 0, out, room, &length));
-    CHECK(uplink.next_sequence == 7);
+    CHECK(uplink.next_sequence == 9);
 }
 
 /* Prefixes, and flips of single bits, from blocks of exactly their size. */

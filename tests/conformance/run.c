@@ -1,13 +1,16 @@
 /* Any implementation of psao.h must pass: plays every stream of a folder and compares what comes
  * out with the folder's index.txt, whose lines are
  *
- *     valid CLAUSES NAME FRAMES RESYNCS DIGEST
+ *     valid CLAUSES NAME FRAMES RESYNCS DIGEST [BEFORE]
  *     invalid CLAUSES NAME RESULT
  *
- * FRAMES: complete frames with the right hash. DIGEST: FNV-1a, eight bytes at a time, over the
- * three buffers of each of these frames. RESULT: the psao_result that ends it. A valid stream's
- * NAME.lookups holds lines of an instance, a position, a normal and the openness after its last
- * frame, which may be off by 1/255. Each stream is pushed whole, in pieces, and byte by byte.
+ * CLAUSES: of docs/format.md. BEFORE: the stream that the client got before this one, whatever came
+ * of it, and was then restarted.
+ * FRAMES: complete frames with the right hash. RESYNCS: those with a wrong one. DIGEST: FNV-1a,
+ * eight bytes at a time, over the three buffers of each of the complete ones. RESULT: the
+ * psao_result that ends it. A valid stream's NAME.lookups holds lines of an instance, a position, a
+ * normal and the openness after its last frame, which may be off by 1/255. Each stream is pushed
+ * whole, in pieces, and byte by byte.
  *
  *     run FOLDER
  */
@@ -45,7 +48,8 @@ static unsigned check_lookups(psao_client *client, const char *path) {
     return count;
 }
 
-static outcome play(bytes stream, size_t piece, unsigned frames, const char *lookups) {
+static outcome play(bytes stream, size_t piece, bytes before, unsigned frames,
+                    const char *lookups) {
     outcome out = {0, 0, 14695981039346656037u, PSAO_OK};
     psao_config config;
     memset(&config, 0, sizeof config);
@@ -57,13 +61,18 @@ static outcome play(bytes stream, size_t piece, unsigned frames, const char *loo
     }
     owned made = make(&config);
     size_t done = 0, used = 0;
+    while (done < before.size && psao_client_push(made.client, before.data + done,
+                                                  before.size - done, 0, &used) >= 0)
+        done += used;
+    if (before.size > 0)
+        GIVES(PSAO_OK, psao_client_restart(made.client));
+    done = 0;
     out.result = PSAO_OK;
     while (done < stream.size && out.result >= 0) {
         size_t left = stream.size - done;
         out.result = psao_client_push(made.client, stream.data + done, left < piece ? left : piece,
                                       0, &used);
         done += out.result < 0 ? 0 : used;
-        out.resyncs += out.result == PSAO_RESYNC;
         psao_frame frame;
         memset(&frame, 0, sizeof frame);
         frame.struct_size = sizeof frame;
@@ -78,13 +87,18 @@ static outcome play(bytes stream, size_t piece, unsigned frames, const char *loo
             CHECK(check_lookups(made.client, lookups) > 0);
         GIVES(PSAO_OK, psao_client_release(made.client));
     }
+    psao_stats stats;
+    memset(&stats, 0, sizeof stats);
+    stats.struct_size = sizeof stats;
+    GIVES(PSAO_OK, psao_client_stats(made.client, &stats));
+    out.resyncs = (unsigned)stats.discarded_count;
     free(made.block);
     return out;
 }
 
 int main(int count, char **words) {
     CHECK(count == 2);
-    char path[1024], line[1024], kind[16], clauses[64], name[128];
+    char path[1024], line[1024], kind[16], clauses[256], name[128];
     snprintf(path, sizeof path, "%s/index.txt", words[1]);
     FILE *index = fopen(path, "r");
     if (!index)
@@ -93,9 +107,14 @@ int main(int count, char **words) {
     unsigned passed = 0, failed = 0;
     while (fgets(line, sizeof line, index)) {
         int rest = 0;
-        CHECK(sscanf(line, "%15s %63s %127s %n", kind, clauses, name, &rest) == 3);
+        CHECK(sscanf(line, "%15s %255s %127s %n", kind, clauses, name, &rest) == 3);
         snprintf(path, sizeof path, "%s/%s.psao", words[1], name);
-        bytes stream = read_file(path);
+        bytes stream = read_file(path), before = {NULL, 0};
+        char first[128];
+        if (strcmp(kind, "valid") == 0 && sscanf(line + rest, "%*u %*u %*x %127s", first) == 1) {
+            snprintf(path, sizeof path, "%s/%s.psao", words[1], first);
+            before = read_file(path);
+        }
         snprintf(path, sizeof path, "%s/%s.lookups", words[1], name);
         int good = 1;
         const size_t pieces[] = {stream.size, 977, 1};
@@ -104,18 +123,19 @@ int main(int count, char **words) {
                 unsigned frames, resyncs;
                 uint64_t digest;
                 CHECK(sscanf(line + rest, "%u %u %" SCNx64, &frames, &resyncs, &digest) == 3);
-                outcome out = play(stream, pieces[i], frames, path);
+                outcome out = play(stream, pieces[i], before, frames, path);
                 good = good && out.result >= 0 && out.frames == frames && out.digest == digest &&
                        out.resyncs == resyncs;
             } else {
                 int result;
                 CHECK(strcmp(kind, "invalid") == 0 && sscanf(line + rest, "%d", &result) == 1);
-                good = good && play(stream, pieces[i], 0, NULL).result == result;
+                good = good && play(stream, pieces[i], before, 0, NULL).result == result;
             }
         }
         printf("%s %s [%s]\n", good ? "ok    " : "FAILED", name, clauses);
         passed += good != 0, failed += good == 0;
         free(stream.data);
+        free(before.data);
     }
     fclose(index);
     printf("%u passed, %u failed\n", passed, failed);

@@ -115,8 +115,8 @@ pub struct psao_instance {
     pub bucket_count: u32,
     /// Takes a local normal to cell space, before normalising.
     pub normal_scale: [f32; 3],
-    /// Zero.
-    pub reserved: u32,
+    /// Level of detail, 0 (all points) to 3. For people: the lookup does not need it.
+    pub level: u32,
 }
 
 /// Up to eight cells by their index; 0 ends the list.

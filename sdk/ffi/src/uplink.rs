@@ -4,7 +4,9 @@ use crate::client::{guarded, put, slice_of};
 use crate::result::psao_result::{self, *};
 use crate::types::*;
 use psao::core::stream::{PACKET_HEADER_BYTES, StreamError, Writer, write_packet};
-use psao::core::uplink::{self, Camera, Hello, MAX_JOINTS, MAX_TOKEN_BYTES, Transform, kind};
+use psao::core::uplink::{
+    self, Camera, Hello, MAX_JOINTS, MAX_TOKEN_BYTES, Presence, Transform, kind,
+};
 
 /// The longest message that psao_uplink_joints writes, with 4096 joints.
 pub const PSAO_UPLINK_MAX_BYTES: u32 = 196632;
@@ -208,6 +210,41 @@ pub unsafe extern "C" fn psao_uplink_joints(
         message(uplink, out, kind::JOINTS, |w| {
             uplink::write_joints(w, instance_index, joints)
         })
+    })
+}
+
+/// Writes that you took an instance out of the scene, or put it back: what is out has no points
+/// and occludes nothing. All are in at first. To swap an instance's mesh, have an instance for
+/// each mesh, and put one of them in.
+///
+/// present: 1 if it is in the scene, 0 if it is not.
+///
+/// PSAO_ERROR_VALUE: present is neither.
+///
+/// out, capacity_bytes, out_bytes, Threads and the rest as psao_uplink_hello. Since ABI 1.
+///
+/// # Safety
+/// The pointers are as described.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn psao_uplink_presence(
+    uplink: *mut psao_uplink,
+    instance_index: u32,
+    present: u32,
+    out: *mut u8,
+    capacity_bytes: usize,
+    out_bytes: *mut usize,
+) -> psao_result {
+    // SAFETY: the caller's word.
+    guarded(|| unsafe {
+        if present > 1 {
+            return Err(PSAO_ERROR_VALUE);
+        }
+        let presence = Presence {
+            instance: instance_index,
+            present: present == 1,
+        };
+        let out = (out, capacity_bytes, out_bytes);
+        message(uplink, out, kind::PRESENCE, |w| presence.write(w))
     })
 }
 
