@@ -109,6 +109,16 @@ enum {
   PSAO_ERROR_CAPACITY = -40,
   /* The buffer for what the function writes is too small. */
   PSAO_ERROR_OUTPUT_SIZE = -41,
+  /* No server answers at the address, or the system has no socket or thread to give:
+   * psao_connection_open's text says which. */
+  PSAO_ERROR_NO_CONNECTION = -50,
+  /* Who answers has not the certificate that was asked for: take the fingerprint that the server
+   * prints, or the roots that signed its certificate. */
+  PSAO_ERROR_UNTRUSTED = -51,
+  /* The connection is closed: open a new one, and call psao_client_restart. */
+  PSAO_ERROR_CLOSED = -52,
+  /* The network is slower than what is to be sent: send the newest state again later. */
+  PSAO_ERROR_BUSY = -53,
   /* A defect of the library: it stopped before it could do harm. This client answers nothing
    * else from now on; make a new one, and please report it. */
   PSAO_ERROR_INTERNAL = -90,
@@ -162,6 +172,12 @@ enum {
  * neither ever waits for the other; without, they must not. psao_client_status is anyone's, at any
  * time. */
 typedef struct psao_client psao_client;
+
+#if defined(PSAO_QUIC)
+/* An open connection. Opaque. It takes memory from the heap and has one thread, which runs the
+ * protocol until the connection is closed. */
+typedef struct psao_connection psao_connection;
+#endif
 
 /* Takes a message: message_bytes of UTF-8, not terminated, valid during the call. level is a
  * psao_log_level. Called on the thread of the function that has something to say, and only from
@@ -345,6 +361,27 @@ typedef struct psao_range {
   /* Elements. */
   uint32_t count;
 } psao_range;
+
+#if defined(PSAO_QUIC)
+/* Where to connect, and as whom. Strings are UTF-8 and end with a zero byte. */
+typedef struct psao_connect {
+  /* sizeof(psao_connect). */
+  uint32_t struct_size;
+  /* "host:port"; an IPv6 address in brackets. */
+  const char *address;
+  /* The name in the server's certificate; NULL: the host of address. */
+  const char *server_name;
+  /* The token that the server was started with; NULL: none. */
+  const char *token;
+  /* The server has exactly the certificate with this SHA-256, 64 hexadecimal digits: what it
+   * prints when it starts. NULL: roots_pem says who is trusted. */
+  const char *fingerprint;
+  /* Certificates in PEM, one of which signed the server's. NULL if there is a fingerprint. */
+  const char *roots_pem;
+  /* Of psao_client_topology_hash; 0 for a new client. */
+  uint64_t topology_hash;
+} psao_connect;
+#endif
 
 /* Counts a connection's messages: one for what goes up the stream, another one for datagrams.
  * All zero at the start of every connection. Yours: no client knows of it. */
@@ -557,6 +594,72 @@ psao_result psao_client_lookup(const struct psao_client *client,
  *
  * Threads: taker. Time: grows with what changed. No alloc, lock or log. Since ABI 1. */
 psao_result psao_client_release(struct psao_client *client);
+
+#if defined(PSAO_QUIC)
+/* Connects to a server and sends the hello: what psao_uplink_hello would write, with config and
+ * connect's token. Waits until the server has proved who it is, or 5 s if nothing answers: not
+ * for the frame loop.
+ *
+ * out_text, text_bytes: room for a sentence about why it failed, for a log; may be NULL and 0.
+ * Unlike other outputs it is written on failure only, and ends with a zero byte.
+ *
+ * PSAO_ERROR_VALUE: a string is not UTF-8 or not what it should be, or there is not exactly one
+ * of fingerprint and roots_pem. PSAO_ERROR_UNTRUSTED, PSAO_ERROR_NO_CONNECTION.
+ *
+ * Threads: any. Takes memory, and starts a thread. Safe on untrusted input. Since ABI 1, in
+ * libraries built with the feature quic. */
+psao_result psao_connection_open(const struct psao_connect *connect,
+                                 const struct psao_config *config,
+                                 char *out_text,
+                                 size_t text_bytes,
+                                 struct psao_connection **out_connection);
+#endif
+
+#if defined(PSAO_QUIC)
+/* Takes bytes of the stream that have come, at most capacity_bytes, for psao_client_push. Never
+ * waits. What is not taken stays, up to 1 MiB; beyond that the server is asked to wait, and
+ * merges what changes meanwhile.
+ *
+ * out_bytes: how many.
+ *
+ * PSAO_NOTHING_NEW: none have come since. PSAO_ERROR_CLOSED: none will come any more, and all
+ * that came was taken: out_text, if not NULL, has a sentence about why, as in
+ * psao_connection_open.
+ *
+ * Threads: exclusive per connection. Takes memory now and then, and a lock that the connection's
+ * thread holds for short. Since ABI 1, in libraries built with the feature quic. */
+psao_result psao_connection_receive(struct psao_connection *connection,
+                                    uint8_t *out,
+                                    size_t capacity_bytes,
+                                    size_t *out_bytes,
+                                    char *out_text,
+                                    size_t text_bytes);
+#endif
+
+#if defined(PSAO_QUIC)
+/* Sends a message that a psao_uplink_ function wrote, but for the hello, which was sent. Its
+ * number does not matter: the connection counts anew. Cameras and acknowledgements overtake
+ * older ones; all else arrives surely and in order. Never waits.
+ *
+ * PSAO_ERROR_VALUE: it is no such message. PSAO_ERROR_BUSY: the network is slower than the
+ * messages: send the newest state again later. PSAO_ERROR_CLOSED: see psao_connection_receive.
+ *
+ * Threads: exclusive per connection. Takes memory now and then, and a lock that the connection's
+ * thread holds for short. Since ABI 1, in libraries built with the feature quic. */
+psao_result psao_connection_send(struct psao_connection *connection,
+                                 const uint8_t *message,
+                                 size_t message_bytes);
+#endif
+
+#if defined(PSAO_QUIC)
+/* Closes the connection, tells the server, ends its thread and frees its memory. Waits at most
+ * 1 s.
+ *
+ * connection: not to be used afterwards. NULL does nothing.
+ *
+ * Threads: exclusive per connection. Since ABI 1, in libraries built with the feature quic. */
+psao_result psao_connection_close(struct psao_connection *connection);
+#endif
 
 /* The name of a result, and what to do about it, in one line for a log. Never NULL.
  *

@@ -1,7 +1,10 @@
 //! libpsao as C and C++ programs get it: installed to a prefix, linked, and used.
 
 use clap::Parser;
+use psao_core::mirror::Capacity;
 use psao_server::commands::{RecordArgs, record};
+use psao_server::identity::Identity;
+use psao_server::transport::{Event, OwnedMessage, Transport, TransportConfig};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::LazyLock;
@@ -188,6 +191,80 @@ fn any_implementation_of_the_header_can_be_checked_with_the_conformance_streams(
         let output = Command::new(&program).arg(&copy).output().unwrap();
         assert!(!output.status.success());
     }
+}
+
+/// The library with the feature `quic`, as this profile builds it.
+fn with_quic() -> PathBuf {
+    let messages = run(Command::new(env!("CARGO")).current_dir(root()).args([
+        "build",
+        "--locked",
+        "-p",
+        "psao-ffi",
+        "--features",
+        "quic",
+        "--message-format",
+        "json",
+    ]));
+    let mut paths = messages.split('"');
+    paths
+        .rfind(|part| part.ends_with("/libpsao.a"))
+        .unwrap()
+        .into()
+}
+
+#[test]
+fn a_c_program_connects_plays_what_comes_and_is_heard() {
+    let folder = tempfile::tempdir().unwrap();
+    let program = folder.path().join("connect");
+    run(Command::new("cc")
+        .args(WARNINGS)
+        .arg("-std=c99")
+        .arg("-I")
+        .arg(root().join("include"))
+        .arg(root().join("tests/c/connect.c"))
+        .arg(with_quic())
+        .args(["-lpthread", "-ldl", "-lm", "-o"])
+        .arg(&program));
+    let stream = root().join("tests/conformance/streams/cells.psao");
+    let identity = Identity::load_or_create(folder.path()).unwrap();
+    let fingerprint = identity.fingerprint().to_string();
+    let mut server = Transport::start(TransportConfig {
+        listen: "127.0.0.1:0".parse().unwrap(),
+        identity,
+        token: "open sesame".into(),
+        max_clients: 1,
+        scene_hash: 0,
+        capacity: Capacity::default(),
+    })
+    .unwrap();
+    let mut client = Command::new(&program)
+        .arg(server.local_addr().to_string())
+        .args([&fingerprint, "open sesame"])
+        .arg(&stream)
+        .spawn()
+        .unwrap();
+    let mut heard = Vec::new();
+    let ended = loop {
+        for event in server.events() {
+            match event {
+                Event::Joined(id, _) => server.send(id, std::fs::read(&stream).unwrap()),
+                Event::Message(_, OwnedMessage::Ack(frame)) => {
+                    heard.push(format!("frame {frame}"));
+                    server.close();
+                }
+                Event::Message(_, message) => heard.push(format!("{message:?}")),
+                Event::Left(..) => {}
+            }
+        }
+        if let Some(ended) = client.try_wait().unwrap() {
+            break ended;
+        }
+        std::thread::sleep(std::time::Duration::from_millis(1));
+    };
+    assert!(ended.success(), "{heard:?}");
+    assert_eq!(heard.len(), 2, "{heard:?}");
+    assert!(heard[0].contains("present: false"), "{heard:?}");
+    assert_eq!(heard[1], "frame 10");
 }
 
 #[test]

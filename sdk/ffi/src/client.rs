@@ -937,3 +937,57 @@ pub unsafe extern "C" fn psao_client_release(client: *mut psao_client) -> psao_r
         })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_panic_stops_at_the_border_and_poisons_the_client() {
+        let config = psao_config {
+            instance_count: 1,
+            bucket_count: 1,
+            cell_count: 1,
+            max_body_bytes: 64,
+            max_raw_bytes: 64,
+            ..psao_config::default()
+        };
+        let mut memory = vec![Line::default(); config.lines().unwrap()];
+        let mut client = std::ptr::null_mut();
+        let bytes = size_of_val(&memory[..]);
+        // SAFETY: all that is passed lives until the end, and the client is used from here alone.
+        unsafe {
+            let init = psao_client_init(&config, memory.as_mut_ptr().cast(), bytes, &mut client);
+            assert_eq!(init, PSAO_OK);
+            let mut used = 77;
+            let push = |used: &mut usize| psao_client_push(client, c"".as_ptr().cast(), 0, 0, used);
+            assert_eq!((push(&mut used), used), (PSAO_NEED_MORE, 0));
+
+            // Every function of a client runs in this.
+            let hook = std::panic::take_hook();
+            std::panic::set_hook(Box::new(|_| ()));
+            let result = with(client, |_| panic!("provoked"));
+            let elsewhere = guarded(|| panic!("provoked"));
+            std::panic::set_hook(hook);
+            assert_eq!([result, elsewhere], [PSAO_ERROR_INTERNAL; 2]);
+
+            used = 77;
+            assert_eq!((push(&mut used), used), (PSAO_ERROR_INTERNAL, 77));
+            let mut status = psao_status {
+                struct_size: size_of::<psao_status>() as u32,
+                state: 77,
+                live_ns: 77,
+            };
+            let asked = psao_client_status(client, 0, &mut status);
+            assert_eq!((asked, status.state), (PSAO_ERROR_INTERNAL, 77));
+            assert_eq!(psao_client_restart(client), PSAO_ERROR_INTERNAL);
+            assert_eq!(psao_client_release(client), PSAO_ERROR_INTERNAL);
+
+            // A new client in the same memory knows nothing of it.
+            let init = psao_client_init(&config, memory.as_mut_ptr().cast(), bytes, &mut client);
+            assert_eq!(init, PSAO_OK);
+            let push = psao_client_push(client, std::ptr::null(), 0, 0, &mut used);
+            assert_eq!(push, PSAO_NEED_MORE);
+        }
+    }
+}

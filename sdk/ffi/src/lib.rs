@@ -9,6 +9,8 @@
 #![allow(non_camel_case_types)]
 
 mod client;
+#[cfg(feature = "quic")]
+mod connection;
 mod front;
 mod handoff;
 mod result;
@@ -17,6 +19,8 @@ mod types;
 mod uplink;
 
 pub use client::*;
+#[cfg(feature = "quic")]
+pub use connection::*;
 pub use result::{psao_result, psao_result_str};
 pub use types::*;
 pub use uplink::*;

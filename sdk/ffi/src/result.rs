@@ -64,6 +64,16 @@ pub enum psao_result {
     PSAO_ERROR_CAPACITY = -40,
     /// The buffer for what the function writes is too small.
     PSAO_ERROR_OUTPUT_SIZE = -41,
+    /// No server answers at the address, or the system has no socket or thread to give:
+    /// psao_connection_open's text says which.
+    PSAO_ERROR_NO_CONNECTION = -50,
+    /// Who answers has not the certificate that was asked for: take the fingerprint that the server
+    /// prints, or the roots that signed its certificate.
+    PSAO_ERROR_UNTRUSTED = -51,
+    /// The connection is closed: open a new one, and call psao_client_restart.
+    PSAO_ERROR_CLOSED = -52,
+    /// The network is slower than what is to be sent: send the newest state again later.
+    PSAO_ERROR_BUSY = -53,
     /// A defect of the library: it stopped before it could do harm. This client answers nothing
     /// else from now on; make a new one, and please report it.
     PSAO_ERROR_INTERNAL = -90,
@@ -157,6 +167,22 @@ const NAMES: &[(psao_result, &CStr)] = &[
     (
         PSAO_ERROR_OUTPUT_SIZE,
         c"PSAO_ERROR_OUTPUT_SIZE: the output buffer is too small",
+    ),
+    (
+        PSAO_ERROR_NO_CONNECTION,
+        c"PSAO_ERROR_NO_CONNECTION: check the address, and that the server runs",
+    ),
+    (
+        PSAO_ERROR_UNTRUSTED,
+        c"PSAO_ERROR_UNTRUSTED: another certificate than the one asked for",
+    ),
+    (
+        PSAO_ERROR_CLOSED,
+        c"PSAO_ERROR_CLOSED: the connection is closed: open a new one",
+    ),
+    (
+        PSAO_ERROR_BUSY,
+        c"PSAO_ERROR_BUSY: send the newest state again later",
     ),
     (
         PSAO_ERROR_INTERNAL,

@@ -37,6 +37,9 @@ const INTRODUCTION: &str = "\
  */
 ";
 
+/// Defined by those whose library has the feature `quic`.
+const QUIC: &str = "PSAO_QUIC";
+
 /// The header's text.
 ///
 /// # Errors
@@ -54,6 +57,7 @@ pub fn generate(root: &Path) -> Result<String, String> {
         line_length: 100,
         ..Config::default()
     };
+    config.defines.insert("feature = quic".into(), QUIC.into());
     // Enums that functions take and write as uint32_t.
     config.export.include = ["psao_log_level", "psao_buffer", "psao_state"]
         .map(String::from)
@@ -134,9 +138,14 @@ fn enums(text: &str) -> String {
     out
 }
 
-/// Functions that the header declares, sorted.
+/// Functions that the header declares, sorted, but for those of the feature `quic`.
 pub fn functions(header: &str) -> Vec<String> {
-    let mut names: Vec<String> = declarations(header)
+    let optional = format!("#if defined({QUIC})\n");
+    let always = header
+        .split("\n\n")
+        .filter(|part| !part.starts_with(&optional));
+    let header = always.collect::<Vec<_>>().join("\n\n") + "\n\n";
+    let mut names: Vec<String> = declarations(&header)
         .map(|(name, _)| name.to_string())
         .collect();
     names.sort();
@@ -147,6 +156,10 @@ pub fn functions(header: &str) -> Vec<String> {
 fn declarations(header: &str) -> impl Iterator<Item = (&str, &str)> {
     let mut comment = "";
     header.split_inclusive("\n\n").flat_map(move |part| {
+        let part = match part.strip_prefix("#if ") {
+            Some(rest) => rest.split_once('\n')?.1,
+            None => part,
+        };
         if part.starts_with("/*") {
             comment = part;
         }

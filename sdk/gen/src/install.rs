@@ -14,6 +14,7 @@ pub fn install(root: &Path, prefix: &Path) -> Result<(), String> {
     let build = Command::new(std::env::var("CARGO").unwrap_or("cargo".into()))
         .current_dir(root)
         .args(["build", "--locked", "--profile", "sdk", "-p", "psao-ffi"])
+        .args(["--features", "thin"])
         .args(["--message-format", "json"])
         .output()
         .map_err(|error| format!("cargo: {error}"))?;
