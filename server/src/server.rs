@@ -269,7 +269,7 @@ impl Server {
         self.viewers.get(&id)?.encoder.cells(&self.world)
     }
 
-    /// [`point_rmse`] of what a client has, over what that client sees.
+    /// [`Encoder::point_rmse`] of what a client has, over what that client sees.
     pub fn point_rmse(&self, id: ClientId, client: &psao::Client) -> Option<f64> {
         let viewer = self.viewers.get(&id)?;
         let residual = matches!(self.settings.scheme, Scheme::Residual(..));

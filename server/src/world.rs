@@ -1069,7 +1069,7 @@ impl World {
     }
 
     /// Whether any of some points of a slice, which `seed` chooses, can be seen from `eye` or from
-    /// less than [`LOOKAHEAD_M`] around it.
+    /// less than 0.7 m around it.
     pub fn is_seen(&self, slice: &Slice, eye: Vec3, samples: u32, seed: u32) -> bool {
         let triangles = &self.mesh(slice.instance).triangles;
         let (positions, normals) = self.vertices(slice.instance);

@@ -1,6 +1,6 @@
 //! Topology: where a mesh's points are, in patches of up to [`PATCH_POINTS`], compactly coded.
 //!
-//! A patch is coded by [`code_points`], the same function for writer and reader. It is halved again
+//! A patch is coded by one function, the same for writer and reader. It is halved again
 //! and again, and how many points each half has is coded, until a part has one point. What is left
 //! of that point's position is plain along the surface, and predicted from its normal across it.
 #![deny(
