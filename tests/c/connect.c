@@ -64,7 +64,8 @@ int main(int count, char **words) {
             CHECK(waits++ < 60000);
         }
         for (size_t done = 0, used; result == PSAO_OK && done < arrived; done += used) {
-            psao_result pushed = psao_client_push(made.client, came + done, arrived - done, 0, &used);
+            psao_result pushed =
+                psao_client_push(made.client, came + done, arrived - done, 0, &used);
             CHECK(pushed >= 0);
             frames += pushed == PSAO_OK;
         }

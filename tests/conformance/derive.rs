@@ -860,7 +860,7 @@ fn broken_slices(parts: &Parts) -> Vec<Invalid> {
         .find(|(at, slice)| *at != index && slice.point_count > 0);
     let other_first = used.unwrap().1.point_first;
     let blocks = kept[index as usize].point_count.div_ceil(16);
-    assert!(blocks % 8 != 0, "the slice has a bit to spare");
+    assert!(!blocks.is_multiple_of(8), "the slice has a bit to spare");
     let header = |at: usize, bytes: &[u8]| {
         parts.changed(|list| list[0].2[at..at + bytes.len()].copy_from_slice(bytes))
     };
@@ -1043,8 +1043,8 @@ fn client() -> Client {
     })
 }
 
-/// What the Rust client makes of a valid stream, after another one or none: frames, resyncs, digest,
-/// and lookups at the end.
+/// What the Rust client makes of a valid stream, after another one or none: frames, resyncs,
+/// digest, and lookups at the end.
 fn reference(bytes: &[u8], before: &[u8]) -> (u32, u64, u64, String) {
     let mut client = client();
     let mut rest = before;
