@@ -322,6 +322,9 @@ fn the_shared_library_exports_the_listed_functions_and_nothing_else() {
     symbols.sort_unstable();
     let listed = include_str!("../sdk/ffi/exports.txt");
     assert_eq!(symbols, listed.lines().collect::<Vec<_>>());
+    // As the guide says: 403 KiB on x86_64.
+    let bytes = std::fs::metadata(&library).unwrap().len();
+    assert!(bytes < 440 << 10, "{bytes} bytes");
 }
 
 #[test]

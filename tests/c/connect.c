@@ -40,15 +40,15 @@ int main(int count, char **words) {
     owned made = make(&config);
     psao_uplink uplink = {0};
     uint8_t message[PSAO_UPLINK_SMALL_BYTES], came[777];
-    size_t length = 0, got = 0;
+    size_t length = 0, arrived = 0;
     GIVES(PSAO_ERROR_VALUE, psao_connection_send(connection, message, 3));
     GIVES(PSAO_OK,
           psao_uplink_hello(&uplink, &config, NULL, 0, 0, message, sizeof message, &length));
     GIVES(PSAO_ERROR_VALUE, psao_connection_send(connection, message, length));
     GIVES(PSAO_OK, psao_uplink_presence(&uplink, 3, 0, message, sizeof message, &length));
     GIVES(PSAO_OK, psao_connection_send(connection, message, length));
-    GIVES(PSAO_ERROR_NULL, psao_connection_receive(NULL, came, sizeof came, &got, NULL, 0));
-    GIVES(PSAO_ERROR_NULL, psao_connection_receive(connection, NULL, 1, &got, NULL, 0));
+    GIVES(PSAO_ERROR_NULL, psao_connection_receive(NULL, came, sizeof came, &arrived, NULL, 0));
+    GIVES(PSAO_ERROR_NULL, psao_connection_receive(connection, NULL, 1, &arrived, NULL, 0));
 
     psao_status status;
     memset(&status, 0, sizeof status);
@@ -56,15 +56,16 @@ int main(int count, char **words) {
     unsigned frames = 0;
     for (int waits = 0; status.state != PSAO_STATE_ENDED;) {
         psao_result result =
-            psao_connection_receive(connection, came, sizeof came, &got, text, sizeof text);
+            psao_connection_receive(connection, came, sizeof came, &arrived, text, sizeof text);
         CHECK(result == PSAO_OK || result == PSAO_NOTHING_NEW);
         if (result == PSAO_NOTHING_NEW) {
             struct timespec pause = {0, 1000000};
             nanosleep(&pause, NULL);
             CHECK(waits++ < 60000);
         }
-        for (size_t done = 0, used; result == PSAO_OK && done < got; done += used) {
-            psao_result pushed = psao_client_push(made.client, came + done, got - done, 0, &used);
+        for (size_t done = 0, used; result == PSAO_OK && done < arrived; done += used) {
+            psao_result pushed =
+                psao_client_push(made.client, came + done, arrived - done, 0, &used);
             CHECK(pushed >= 0);
             frames += pushed == PSAO_OK;
         }
@@ -75,7 +76,7 @@ int main(int count, char **words) {
     /* The server closes when it has that. */
     for (int waits = 0;; waits++) {
         psao_result result =
-            psao_connection_receive(connection, came, sizeof came, &got, text, sizeof text);
+            psao_connection_receive(connection, came, sizeof came, &arrived, text, sizeof text);
         if (result == PSAO_ERROR_CLOSED)
             break;
         CHECK(result == PSAO_NOTHING_NEW && waits < 60000);

@@ -1043,8 +1043,8 @@ fn client() -> Client {
     })
 }
 
-/// What the Rust client makes of a valid stream, after another one or none: frames, resyncs, digest,
-/// and lookups at the end.
+/// What the Rust client makes of a valid stream, after another one or none: frames, resyncs,
+/// digest, and lookups at the end.
 fn reference(bytes: &[u8], before: &[u8]) -> (u32, u64, u64, String) {
     let mut client = client();
     let mut rest = before;

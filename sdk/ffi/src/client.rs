@@ -952,7 +952,7 @@ mod tests {
             max_raw_bytes: 64,
             ..psao_config::default()
         };
-        let mut memory = vec![Line::default(); config.lines().unwrap()];
+        let mut memory: Vec<Line> = vec![bytemuck::Zeroable::zeroed(); config.lines().unwrap()];
         let mut client = std::ptr::null_mut();
         let bytes = size_of_val(&memory[..]);
         // SAFETY: all that is passed lives until the end, and the client is used from here alone.
