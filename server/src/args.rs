@@ -108,7 +108,7 @@ pub struct StreamArgs {
     pub max_mbit: f64,
     /// Instances so far away that they have more points than this a pixel get fewer (profile
     /// residual); 0 for all points always
-    #[arg(long, value_name = "N", default_value_t = 1.0)]
+    #[arg(long, value_name = "N", default_value_t = 0.0)]
     pub points_per_pixel: f32,
     /// The extended field of view reaches this much farther on every side, degrees
     #[arg(long, value_name = "DEGREES", default_value_t = 10.0)]
