@@ -209,11 +209,15 @@ impl Residual {
         };
         let mut out = Frame::default();
         self.drop_absent(world, &mut out);
-        let lacks = self.lacks(world, view);
+        let mut lacks = self.lacks(world, view);
         self.choose_levels(world, view, &lacks, room, &mut out);
+        if !out.closes.is_empty() {
+            // What changed its level is lacking as a whole now.
+            lacks = self.lacks(world, view);
+        }
         // All of an instance's slices change level in one frame, so that none is missing.
         let (mut now, mut later): (Vec<Lack>, Vec<Lack>) = (Vec::new(), Vec::new());
-        for lack in self.lacks(world, view) {
+        for lack in lacks {
             let fading = self.fades.get(&lack.index);
             let whole = lack.opens && fading.is_some_and(|fade| fade.begun == self.frames);
             if whole { &mut now } else { &mut later }.push(lack);
@@ -248,12 +252,13 @@ impl Residual {
     /// The slices in view that the client does not have, or that differ.
     fn lacks(&mut self, world: &World, view: &View<'_>) -> Vec<Lack> {
         let (frames, quantiser) = (self.frames, self.quantiser);
-        let (heap, due, fades) = (&self.heap, &self.due, &self.fades);
+        let (heap, fades) = (&self.heap, &self.fades);
         let mirror = &self.mirror;
         let marks = self.seen.par_iter_mut().zip(&mut self.sighted);
+        let marks = marks.zip(&mut self.due);
         let lacks = world.slices.par_iter().zip(marks).enumerate();
         lacks
-            .filter_map(|(index, (slice, (seen, sighted)))| {
+            .filter_map(|(index, (slice, ((seen, sighted), due)))| {
                 if !(view.sees)(slice.bounds) || !world.is_present(slice.instance) {
                     return None;
                 }
@@ -276,7 +281,7 @@ impl Residual {
                 let open = &heap.get()[index];
                 let opens = open.point_count == 0;
                 let fading = fades.contains_key(&(index as u32));
-                if !(opens || due[index] || fading) {
+                if !(opens || *due || fading) {
                     return None;
                 }
                 let want = world.occlusion(slice).iter();
@@ -296,6 +301,8 @@ impl Residual {
                 };
                 let shows = !opens && to_show(world, mirror, slice, open) & !open.shown != 0;
                 if squares == 0 && !shows && !fading {
+                    // Near enough until the world changes it again.
+                    *due = false;
                     return None;
                 }
                 let near = view
