@@ -873,18 +873,16 @@ fn predict(
     across: usize,
     offset: [u32; 3],
 ) -> u32 {
-    let of = |offset: [u32; 3]| {
-        let [x, y, z] = offset.map(i64::from);
-        match across {
-            0 => [y, z, x],
-            1 => [x, z, y],
-            _ => [x, y, z],
-        }
+    // Along the surface twice, then across it.
+    let of = |[x, y, z]: [i64; 3]| match across {
+        0 => [y, z, x],
+        1 => [x, z, y],
+        _ => [x, y, z],
     };
-    let [u, v, _] = of(offset);
+    let [u, v, _] = of(offset.map(i64::from));
     let mut nearest = (i64::MAX, [0; 3]);
     for point in back.iter().rev() {
-        let [from_u, from_v, from] = of(frame.offset(point.position));
+        let [from_u, from_v, from] = of(frame.offset(point.position).map(i64::from));
         let (by_u, by_v) = (u.wrapping_sub(from_u), v.wrapping_sub(from_v));
         let turned = i64::from(point.normal != normal) << 6;
         let far = by_u.abs().wrapping_add(by_v.abs()).wrapping_add(turned);
@@ -893,12 +891,7 @@ fn predict(
         }
     }
     let [by_u, by_v, from] = nearest.1;
-    let [x, y, z] = steps.map(i64::from);
-    let [step_u, step_v, rise] = match across {
-        0 => [y, z, x],
-        1 => [x, z, y],
-        _ => [x, y, z],
-    };
+    let [step_u, step_v, rise] = of(steps.map(i64::from));
     let slope = by_u
         .wrapping_mul(step_u)
         .wrapping_add(by_v.wrapping_mul(step_v));
