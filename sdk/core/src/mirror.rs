@@ -258,11 +258,39 @@ impl<M: Memory> Mirror<M> {
         let cell = parts.cells.get_mut(index as usize);
         if let Some(old) = cell.and_then(|cell| cell.points.get_mut(at as usize)) {
             // Word 0 is the key.
-            let hash = |point: Point| word_hash(3, index, at + 1, point.0);
-            self.hash = self.hash.wrapping_sub(hash(*old)).wrapping_add(hash(point));
+            let factor = word_factor(3, index, at + 1);
+            let change = u64::from(point.0).wrapping_sub(u64::from(old.0));
+            self.hash = self.hash.wrapping_add(factor.wrapping_mul(change));
             *old = point;
             let (_, _, set) = split_sets(parts.dirty, capacity);
             dirty::mark(set, capacity.cells as usize, index as usize);
+        }
+    }
+
+    /// Sets the occlusion of those of a slice's points that changed last, where they are stored.
+    pub(crate) fn set_occlusion(&mut self, places: &[u32], values: &[u8], last: &[i8]) {
+        let capacity = self.capacity();
+        let parts = self.memory.parts_mut();
+        let (_, _, set) = split_sets(parts.dirty, capacity);
+        let runs = places.chunks(8).zip(values.chunks(8)).zip(last.chunks(8));
+        for ((places, values), last) in runs {
+            if last.iter().all(|change| *change == 0) {
+                continue;
+            }
+            let changed = places.iter().zip(values).zip(last);
+            for ((place, value), _) in changed.filter(|(_, change)| **change != 0) {
+                let (index, at) = (place >> 3, place & 7);
+                // NOWHERE's place in a cell is one that no cell has.
+                let cell = parts.cells.get_mut(index as usize);
+                if let Some(point) = cell.and_then(|cell| cell.points.get_mut(at as usize)) {
+                    // Occlusion is a word's lowest byte; word 0 is the key.
+                    let change = u64::from(*value).wrapping_sub(u64::from(point.occlusion()));
+                    let factor = word_factor(3, index, at + 1);
+                    self.hash = self.hash.wrapping_add(factor.wrapping_mul(change));
+                    *point = point.with_occlusion(*value);
+                    dirty::mark(set, capacity.cells as usize, index as usize);
+                }
+            }
         }
     }
 
@@ -405,8 +433,11 @@ fn hash_of<T: bytemuck::Pod>(value: &T, index: u32, kind: u64) -> u64 {
 }
 
 fn word_hash(kind: u64, index: u32, at: u32, word: u32) -> u64 {
-    let factor = mix(kind << 56 | u64::from(index) << 8 | u64::from(at)) | 1;
-    factor.wrapping_mul(u64::from(word))
+    word_factor(kind, index, at).wrapping_mul(u64::from(word))
+}
+
+fn word_factor(kind: u64, index: u32, at: u32) -> u64 {
+    mix(kind << 56 | u64::from(index) << 8 | u64::from(at)) | 1
 }
 
 /// The finaliser of SplitMix64.

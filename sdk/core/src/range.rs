@@ -198,6 +198,7 @@ impl<'a> Decoder<'a> {
     }
 
     /// Reads one decision.
+    #[inline(always)]
     pub fn bit(&mut self, odds: &mut Odds) -> bool {
         let bound = (self.range >> 16).wrapping_mul(odds.yes());
         let yes = self.code < bound;

@@ -55,45 +55,41 @@ pub struct Neighbours {
 pub fn find_neighbours(points: &[PatchPoint], first: bool, out: &mut [Neighbours]) {
     let window = if first { WINDOW_FIRST } else { WINDOW };
     let count = points.len().min(out.len()).min(SLICE_POINTS);
-    // Coordinates side by side, so that distances to a whole window are computed at once. What is
-    // farther apart than `FAR` counts as that.
-    let mut axes = [[0i32; SLICE_POINTS]; 3];
+    // Coordinates side by side, so that distances to a whole window are computed at once: in 16 bits,
+    // which every processor multiplies many of at a time, where a patch is as small as most are.
     let corner = points.first().map_or([0; 3], |point| point.position);
-    for (axis, (places, corner)) in axes.iter_mut().zip(corner).enumerate() {
-        for (place, point) in places.iter_mut().zip(points) {
+    let mut axes = [[0i32; SLICE_POINTS]; 3];
+    let mut small = [[0i16; SLICE_POINTS]; 3];
+    let mut fits = true;
+    for (axis, ((places, small), corner)) in axes.iter_mut().zip(&mut small).zip(corner).enumerate()
+    {
+        let places = places.iter_mut().zip(small).take(count);
+        for ((place, small), point) in places.zip(points) {
             let position = point.position.get(axis).copied().unwrap_or_default();
             *place = position.wrapping_sub(corner) as i32;
+            *small = *place as i16;
+            fits &= place.unsigned_abs() <= FAR as u32 / 2;
         }
     }
-    let [xs, ys, zs] = &axes;
     let mut later = [NONE; SLICE_POINTS];
     // How near one has to be to be among them.
     let mut later_wanted = [if first { 0 } else { i32::MAX }; SLICE_POINTS];
     let mut squares = [0i32; WINDOW];
     for at in 0..count {
         let start = at.saturating_sub(window);
-        let (Some(x), Some(y), Some(z), Some(point)) =
-            (xs.get(at), ys.get(at), zs.get(at), points.get(at))
-        else {
-            break;
-        };
-        let (Some(xs), Some(ys), Some(zs)) =
-            (xs.get(start..at), ys.get(start..at), zs.get(start..at))
-        else {
-            break;
-        };
-        let along = |p: i32, q: i32| {
-            let steps = p.wrapping_sub(q).clamp(-FAR, FAR);
-            steps.wrapping_mul(steps)
-        };
-        for (((square, px), py), pz) in squares.iter_mut().zip(xs).zip(ys).zip(zs) {
-            *square = along(*px, *x)
-                .wrapping_add(along(*py, *y))
-                .wrapping_add(along(*pz, *z));
+        if fits {
+            square_distances(&small, start..at, &mut squares, |p, q| {
+                i32::from(p.wrapping_sub(q))
+            });
+        } else {
+            square_distances(&axes, start..at, &mut squares, |p, q| {
+                p.wrapping_sub(q).clamp(-FAR, FAR)
+            });
         }
         let mut earlier = NONE;
         let mut earlier_wanted = i32::MAX;
-        let (Some(others), Some(laters), Some(laters_wanted)) = (
+        let (Some(point), Some(others), Some(laters), Some(laters_wanted)) = (
+            points.get(at),
             points.get(start..at),
             later.get_mut(start..at),
             later_wanted.get_mut(start..at),
@@ -122,6 +118,31 @@ pub fn find_neighbours(points: &[PatchPoint], first: bool, out: &mut [Neighbours
     }
     for (out, later) in out.iter_mut().zip(&later).take(count) {
         out.later = later.map(|candidate| candidate as u8);
+    }
+}
+
+/// Squared distances of a window's points from the one behind it; `apart` says how far two
+/// coordinates are apart.
+fn square_distances<T: Copy>(
+    axes: &[[T; SLICE_POINTS]; 3],
+    window: core::ops::Range<usize>,
+    squares: &mut [i32; WINDOW],
+    apart: impl Fn(T, T) -> i32,
+) {
+    let end = window.end;
+    let [Some((xs, x)), Some((ys, y)), Some((zs, z))] = axes
+        .each_ref()
+        .map(|axis| axis.get(window.clone()).zip(axis.get(end).copied()))
+    else {
+        return;
+    };
+    let square = |p: T, q: T| {
+        let apart = apart(p, q);
+        apart.wrapping_mul(apart)
+    };
+    for (((sum, px), py), pz) in squares.iter_mut().zip(xs).zip(ys).zip(zs) {
+        let [x, y, z] = [square(*px, x), square(*py, y), square(*pz, z)];
+        *sum = x.wrapping_add(y).wrapping_add(z);
     }
 }
 
@@ -625,6 +646,7 @@ fn get(parts: &[i32; SLICE_POINTS], at: usize) -> i32 {
         .unwrap_or_default()
 }
 
+#[inline(always)]
 fn code_steps<S: Side>(
     side: &mut S,
     contexts: &mut Contexts,

@@ -14,9 +14,7 @@ use crate::bins::{self, Bin, NOWHERE, Place};
 use crate::grid::Instance;
 use crate::mirror::{Memory, Mirror};
 use crate::point::Point;
-use crate::residual::{
-    BLOCK, Neighbours, Quantiser, SLICE_POINTS, SliceState, decode_slice, find_neighbours,
-};
+use crate::residual::{BLOCK, Neighbours, Quantiser, SliceState, decode_slice, find_neighbours};
 use crate::stream::{Changes, Reader, StreamError, Writer, apply_changes};
 use crate::topology::{PatchPoint, decode_patch};
 use bytemuck::{Pod, Zeroable};
@@ -336,8 +334,8 @@ impl Slices<'_> {
         Some((self.neighbours.get(range)?, state))
     }
 
-    /// Brings the mirror's cells to what a slice's values are now and were `before`, with the
-    /// blocks of `shown` in cells.
+    /// Brings the mirror's cells to what an item made of a slice, with the blocks of `shown` in
+    /// cells.
     ///
     /// # Errors
     /// None of a slice that was opened.
@@ -345,28 +343,31 @@ impl Slices<'_> {
         &mut self,
         mirror: &mut Mirror<M>,
         index: u32,
-        before: &[u8],
+        shown: u64,
+    ) -> Result<(), StreamError> {
+        let range = self.get(index)?.range();
+        if let (Some(places), Some(values), Some(last)) = (
+            self.places.get(range.clone()),
+            self.values.get(range.clone()),
+            self.last.get(range),
+        ) {
+            mirror.set_occlusion(places, values, last);
+        }
+        self.show(mirror, index, shown)
+    }
+
+    /// Has the blocks of `shown` in cells, and no others of the slice.
+    fn show<M: Memory>(
+        &mut self,
+        mirror: &mut Mirror<M>,
+        index: u32,
         shown: u64,
     ) -> Result<(), StreamError> {
         let slice = self.get(index)?;
-        let range = slice.range();
-        let (Some(values), Some(places)) = (
-            self.values.get(range.clone()),
-            self.places.get(range.clone()),
-        ) else {
-            return Err(StreamError::Value);
-        };
-        for ((value, before), place) in values.iter().zip(before).zip(places) {
-            if value != before
-                && *place != NOWHERE
-                && let Some(point) = mirror.point(*place)
-            {
-                mirror.set_point(*place, point.with_occlusion(*value));
-            }
-        }
         if shown == slice.shown {
             return Ok(());
         }
+        let range = slice.range();
         let grid = grid_of(mirror, slice.instance)?;
         let count = self.read_points(&grid, slice.patch)?;
         let (Some(points), Some(values), Some(places)) = (
@@ -408,7 +409,7 @@ impl Slices<'_> {
         mirror: &mut Mirror<M>,
         index: u32,
     ) -> Result<(), StreamError> {
-        self.settle(mirror, index, &[], 0)?;
+        self.show(mirror, index, 0)?;
         if let Some(slice) = self.slices.get_mut(index as usize) {
             *slice = Slice::default();
         }
@@ -523,13 +524,9 @@ pub fn apply_slices<M: Memory>(
         let bytes = r.take(length)?;
         let first = operation == 2;
         let (neighbours, mut state) = slices.side(&slice).ok_or(StreamError::Value)?;
-        let mut before = [255; SLICE_POINTS];
-        for (before, value) in before.iter_mut().zip(&*state.value) {
-            *before = *value;
-        }
         let step = if first { FIRST.step } else { step };
         decode_slice(neighbours, step, &mut state, first, bytes)?;
-        slices.settle(mirror, index, &before, shown)?;
+        slices.settle(mirror, index, shown)?;
     }
     Ok(count)
 }

@@ -551,11 +551,10 @@ impl Residual {
         };
         let mut slices = self.heap.slices();
         let (_, state) = slices.side(&slice).expect("own slices are open");
-        let before = state.value.to_vec();
         state.value.copy_from_slice(&coded.values);
         state.last.copy_from_slice(&coded.last);
         slices
-            .settle(&mut self.mirror, index, &before, shown)
+            .settle(&mut self.mirror, index, shown)
             .expect("own slices are open");
         let operation = match coded.opens {
             Some(opens) => Operation::Open(opens, shown),
