@@ -438,7 +438,7 @@ impl Coded {
         let mut opens = false;
         match operation {
             Operation::Open(at, _) => {
-                slices.open(&self.mirror, index, at).unwrap();
+                slices.open(&self.mirror, index, at, None).unwrap();
                 quantiser = FIRST;
                 opens = true;
             }
@@ -446,7 +446,7 @@ impl Coded {
                 slices.close(&mut self.mirror, index).unwrap();
                 return (index, operation, 0, Vec::new());
             }
-            _ => slices.prepare(&self.mirror, index).unwrap(),
+            _ => slices.prepare(&self.mirror, index, None).unwrap(),
         }
         let slice = slices.get(index).unwrap();
         let shown = match operation {
@@ -454,14 +454,11 @@ impl Coded {
             _ => slice.shown,
         };
         let (neighbours, mut state) = slices.side(&slice).unwrap();
-        let before = state.value.to_vec();
         let target: Vec<u8> = (0..slice.point_count as usize).map(target).collect();
         let mut data = vec![0; MAX_SLICE_BYTES];
         let length = encode_slice(neighbours, quantiser, &mut state, &target, opens, &mut data);
         data.truncate(length.unwrap());
-        slices
-            .settle(&mut self.mirror, index, &before, shown)
-            .unwrap();
+        slices.settle(&mut self.mirror, index, shown).unwrap();
         (index, operation, slice.point_count, data)
     }
 }

@@ -7,12 +7,13 @@ use glam::Vec3;
 use psao_core::Instance;
 use psao_core::bins::{Bin, SCALES};
 use psao_core::cell::CELL_POINTS;
-use psao_core::residual::BLOCK;
+use psao_core::residual::{BLOCK, Neighbours, find_neighbours};
 use psao_core::topology::{LEVELS, MAX_PATCH_BYTES, Order, PATCH_POINTS, PatchPoint, encode_patch};
 use rayon::prelude::*;
 use std::collections::HashMap;
 use std::hash::{BuildHasherDefault, Hasher};
 use std::ops::Range;
+use std::sync::OnceLock;
 
 /// The points of a mesh (for instances whose scales have the same ratios).
 #[derive(Clone, Debug)]
@@ -267,6 +268,8 @@ pub struct Topology {
     pub hash: u64,
     patches: u32,
     bytes: u32,
+    /// Of each patch, level, and first item or not: what all encoders find the same.
+    neighbours: Vec<OnceLock<Vec<Neighbours>>>,
 }
 
 impl Topology {
@@ -288,6 +291,8 @@ impl Topology {
             }
         }
         topology.hash = hash;
+        let kinds = topology.patches as usize * LEVELS as usize * 2;
+        topology.neighbours = vec![OnceLock::new(); kinds];
         topology.sets = sets;
         topology
     }
@@ -308,6 +313,17 @@ impl Topology {
         let range = self.sets[set].patch_range((patch - self.first_patch[set]) as usize);
         let points = self.sets[set].coded[range].iter();
         points.filter(move |point| u32::from(point.level) >= level)
+    }
+
+    /// The neighbours of a patch's points of a level, as [`find_neighbours`] finds them.
+    pub fn neighbours(&self, patch: u32, level: u32, first: bool) -> &[Neighbours] {
+        let kind = (patch * LEVELS + level) * 2 + u32::from(first);
+        self.neighbours[kind as usize].get_or_init(|| {
+            let points: Vec<PatchPoint> = self.points_of(patch, level).copied().collect();
+            let mut neighbours = vec![Neighbours::default(); points.len()];
+            find_neighbours(&points, first, &mut neighbours);
+            neighbours
+        })
     }
 
     /// A patch's bytes.

@@ -211,6 +211,25 @@ impl Slices<'_> {
         Ok(())
     }
 
+    /// Puts a patch's points of a level where [`Slices::open`], [`Slices::prepare`] and
+    /// [`Slices::settle`] look first, for a caller that has them: it spares decoding the patch.
+    pub fn lend_points<'b>(
+        &mut self,
+        patch: u32,
+        level: u32,
+        points: impl Iterator<Item = &'b PatchPoint>,
+    ) {
+        let [lent_patch, lent_level, count] = *self.scratch_of;
+        if count == 0 || [lent_patch, lent_level] != [patch, level] {
+            let mut count = 0u32;
+            for (to, from) in self.scratch.iter_mut().zip(points) {
+                *to = *from;
+                count = count.saturating_add(1);
+            }
+            *self.scratch_of = [patch, level, count];
+        }
+    }
+
     /// Reads a patch's points of an instance's level into the scratch, and says how many.
     fn read_points(&mut self, grid: &Instance, patch: u32) -> Result<usize, StreamError> {
         let index = patch;
@@ -239,8 +258,8 @@ impl Slices<'_> {
         Ok(kept)
     }
 
-    /// Opens a slice: all its points are open and in no cell. Says how many there are; the scratch
-    /// holds them.
+    /// Opens a slice: all its points are open and in no cell. `known`: its neighbours for the
+    /// first item, if the caller has found them before.
     ///
     /// # Errors
     /// There is no such slice, or it is open already; its instance has no grid; its patch has not
@@ -251,6 +270,7 @@ impl Slices<'_> {
         mirror: &Mirror<M>,
         index: u32,
         [instance, patch, point_first]: [u32; 3],
+        known: Option<&[Neighbours]>,
     ) -> Result<(), StreamError> {
         let grid = grid_of(mirror, instance)?;
         let slice = self.slices.get(index as usize).ok_or(StreamError::Value)?;
@@ -282,7 +302,7 @@ impl Slices<'_> {
         ) else {
             return Err(StreamError::Value);
         };
-        find_neighbours(points, true, neighbours);
+        settle_neighbours(points, true, known, neighbours);
         values.fill(255);
         last.fill(0);
         places.fill(NOWHERE);
@@ -301,7 +321,8 @@ impl Slices<'_> {
             .ok_or(StreamError::Order)
     }
 
-    /// Makes an open slice ready for an item after its first.
+    /// Makes an open slice ready for an item after its first. `known`: its neighbours for that, if
+    /// the caller has found them before.
     ///
     /// # Errors
     /// None of a slice that was opened.
@@ -309,13 +330,15 @@ impl Slices<'_> {
         &mut self,
         mirror: &Mirror<M>,
         index: u32,
+        known: Option<&[Neighbours]>,
     ) -> Result<(), StreamError> {
         let slice = self.get(index)?;
         if slice.neighbours_known == 0 {
-            let count = self.read_points(&grid_of(mirror, slice.instance)?, slice.patch)?;
-            let points = self.scratch.get(..count).unwrap_or_default();
+            if known.is_none() {
+                self.read_points(&grid_of(mirror, slice.instance)?, slice.patch)?;
+            }
             if let Some(neighbours) = self.neighbours.get_mut(slice.range()) {
-                find_neighbours(points, false, neighbours);
+                settle_neighbours(self.scratch, false, known, neighbours);
             }
             if let Some(slice) = self.slices.get_mut(index as usize) {
                 slice.neighbours_known = 1;
@@ -436,6 +459,19 @@ impl Slices<'_> {
     }
 }
 
+/// Copies the neighbours that are known, or finds them; of as many points as there is room for.
+fn settle_neighbours(
+    points: &[PatchPoint],
+    first: bool,
+    known: Option<&[Neighbours]>,
+    out: &mut [Neighbours],
+) {
+    match known {
+        Some(known) => out.iter_mut().zip(known).for_each(|(to, from)| *to = *from),
+        None => find_neighbours(points, first, out),
+    }
+}
+
 fn grid_of<M: Memory>(mirror: &Mirror<M>, instance: u32) -> Result<Instance, StreamError> {
     let grid = mirror.instances().get(instance as usize);
     let grid = grid.filter(|grid| grid.bucket_count > 0);
@@ -508,12 +544,15 @@ pub fn apply_slices<M: Memory>(
         count = count.saturating_add(1);
         let operation = head & 3;
         match operation {
-            2 => slices.open(mirror, index, [r.varint()?, r.varint()?, r.varint()?])?,
+            2 => {
+                let opens = [r.varint()?, r.varint()?, r.varint()?];
+                slices.open(mirror, index, opens, None)?;
+            }
             3 => {
                 slices.close(mirror, index)?;
                 continue;
             }
-            _ => slices.prepare(mirror, index)?,
+            _ => slices.prepare(mirror, index, None)?,
         }
         let slice = slices.get(index)?;
         let shown = match operation {

@@ -502,15 +502,24 @@ impl Residual {
         out: &mut Frame,
         stats: &mut FrameStats,
     ) {
+        let level = |slice: &Slice| self.mirror.instances()[slice.instance as usize].level;
+        let slice = |lack: &Lack| &world.slices[lack.index as usize];
+        batch.par_iter().for_each(|lack| {
+            let (slice, topology) = (slice(lack), &world.topology);
+            topology.neighbours(slice.patch, level(slice), lack.opens);
+        });
         let mut ready: Vec<(u32, Option<[u32; 3]>)> = Vec::new();
         for lack in batch {
             if lack.opens {
                 let opens = self.open(world, lack.index, out);
                 ready.extend(opens.map(|opens| (lack.index, Some(opens))));
             } else {
+                let slice = slice(lack);
+                let level = self.mirror.instances()[slice.instance as usize].level;
+                let neighbours = world.topology.neighbours(slice.patch, level, false);
                 let mut slices = self.heap.slices();
                 slices
-                    .prepare(&self.mirror, lack.index)
+                    .prepare(&self.mirror, lack.index, Some(neighbours))
                     .expect("own slices are open");
                 ready.push((lack.index, None));
             }
@@ -550,6 +559,11 @@ impl Residual {
             None => slice.all_blocks(),
         };
         let mut slices = self.heap.slices();
+        if shown != slice.shown {
+            let level = self.mirror.instances()[slice.instance as usize].level;
+            let points = world.topology.points_of(slice.patch, level);
+            slices.lend_points(slice.patch, level, points);
+        }
         let (_, state) = slices.side(&slice).expect("own slices are open");
         state.value.copy_from_slice(&coded.values);
         state.last.copy_from_slice(&coded.last);
@@ -608,8 +622,10 @@ impl Residual {
         }
         let mut slices = self.heap.slices();
         let opens = [slice.instance, slice.patch, first];
+        slices.lend_points(slice.patch, grid.level, points());
+        let neighbours = world.topology.neighbours(slice.patch, grid.level, true);
         slices
-            .open(&self.mirror, index, opens)
+            .open(&self.mirror, index, opens, Some(neighbours))
             .expect("own slices open");
         Some(opens)
     }
