@@ -5,7 +5,7 @@ use crate::encode::{Compression, Limits, Scheme};
 use crate::points::SurfacePoint;
 use crate::scene::{Placement, Scene};
 use crate::server::Settings;
-use crate::world::{Options, Progress, World};
+use crate::world::{MAX_REFRESH_STEPS, Options, Progress, World};
 use clap::{Args, ValueEnum};
 use glam::Vec3;
 use psao_core::Kernel;
@@ -33,9 +33,10 @@ pub struct SceneArgs {
     /// Rays a point, 1 to 4096
     #[arg(long, value_name = "N", default_value_t = 256)]
     pub rays: usize,
-    /// Steps in which each point near what moves is traced once, in turn with its neighbours
-    #[arg(long, value_name = "N", default_value_t = 1)]
-    pub refresh_steps: u32,
+    /// Steps in which each point near what moves is traced once, in turn with its neighbours: 1, 2,
+    /// 4 or 8. Without it, serve takes as many as keep its rate, and all others 1
+    #[arg(long, value_name = "N", value_parser = refresh_steps)]
+    pub refresh_steps: Option<u32>,
     /// Longest ray, metres
     #[arg(long, value_name = "METRES", default_value_t = 0.6)]
     pub ao_distance: f32,
@@ -45,6 +46,13 @@ pub struct SceneArgs {
     /// Seed of the point placement and of the boulders
     #[arg(long, value_name = "N", default_value_t = 1)]
     pub seed: u64,
+}
+
+fn refresh_steps(text: &str) -> Result<u32, String> {
+    let steps = text.parse().ok();
+    steps
+        .filter(|steps: &u32| steps.is_power_of_two() && *steps <= MAX_REFRESH_STEPS)
+        .ok_or_else(|| "must be 1, 2, 4 or 8".into())
 }
 
 /// A kernel by name.
@@ -158,7 +166,7 @@ impl SceneArgs {
         Ok(Options {
             density: self.density,
             rays: self.rays,
-            refresh_steps: self.refresh_steps,
+            refresh_steps: self.refresh_steps.unwrap_or(1),
             ao_distance_m: self.ao_distance,
             seed: self.seed,
             ..Options::of(kernel)

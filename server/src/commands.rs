@@ -4,7 +4,7 @@ use crate::args::{SceneArgs, StreamArgs, camera_path};
 use crate::camera::Frustum;
 use crate::encode::{Encoder, Eye, View, least_capacity};
 use crate::identity::Identity;
-use crate::server::Server;
+use crate::server::{Pace, Server};
 use crate::transport::{Transport, TransportConfig};
 use crate::world::Progress;
 use clap::Args;
@@ -136,20 +136,16 @@ pub fn serve(args: &ServeArgs, out: &mut dyn Write, progress: Progress<'_>) -> R
     let period = Duration::from_secs_f32(1.0 / settings.rate_hz);
     let start = Instant::now();
     let mut next = start;
-    // New surfaces converge with what time the frame leaves.
-    let mut converge_rays = 1u64 << 20;
+    let mut pace = Pace::default();
     let mut frames = 0;
     while args.frames.is_none_or(|last| frames < last) {
         let began = Instant::now();
-        server.frame(&mut transport, (began - start).as_secs_f64(), converge_rays);
-        let busy = began.elapsed();
-        let fits = busy < period.mul_f32(0.8);
-        converge_rays = if fits {
-            converge_rays / 4 * 5
-        } else {
-            converge_rays / 2
-        };
-        converge_rays = converge_rays.clamp(1 << 17, 1 << 30);
+        if args.scene.refresh_steps.is_none() {
+            server.world.options.refresh_steps = pace.refresh_steps;
+        }
+        let time_s = (began - start).as_secs_f64();
+        server.frame(&mut transport, time_s, pace.converge_rays);
+        pace.after(began.elapsed().as_secs_f32() / period.as_secs_f32());
         frames += 1;
         next = (next + period).max(Instant::now());
         std::thread::sleep(next - Instant::now().min(next));

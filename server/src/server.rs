@@ -3,7 +3,7 @@
 use crate::camera::{Camera, Frustum};
 use crate::encode::{Encoder, Eye, FrameStats, Scheme, View};
 use crate::transport::{ClientId, Event, OwnedMessage, Room, Transport};
-use crate::world::{StepStats, World};
+use crate::world::{MAX_REFRESH_STEPS, StepStats, World};
 use glam::{Affine3A, DAffine3, DVec3, Vec3};
 use psao::memory::Heap;
 use psao_core::Mirror;
@@ -20,6 +20,45 @@ pub struct Settings {
     pub rate_hz: f32,
     /// The extended field of view reaches this much farther on every side, radians.
     pub margin_rad: f32,
+}
+
+/// How much a server takes on in a frame, so that it keeps its rate.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Pace {
+    /// Rays for new surfaces: they converge with what time the frame leaves.
+    pub converge_rays: u64,
+    /// Steps in which points near movers take turns ([`crate::world::Options::refresh_steps`]).
+    pub refresh_steps: u32,
+}
+
+impl Default for Pace {
+    fn default() -> Pace {
+        Pace {
+            converge_rays: 1 << 20,
+            refresh_steps: 1,
+        }
+    }
+}
+
+impl Pace {
+    /// After a frame that took `busy` of its time, 1 for all of it. What moves is the last to wait,
+    /// and the first to be up to date again.
+    pub fn after(&mut self, busy: f32) {
+        let [least, most] = [1 << 14, 1 << 30];
+        if busy > 0.8 {
+            if self.converge_rays == least {
+                self.refresh_steps = (self.refresh_steps * 2).min(MAX_REFRESH_STEPS);
+            }
+            self.converge_rays = (self.converge_rays / 2).max(least);
+        } else if self.refresh_steps > 1 {
+            // Twice the points cost at most twice the time.
+            if busy < 0.35 {
+                self.refresh_steps /= 2;
+            }
+        } else {
+            self.converge_rays = (self.converge_rays / 4 * 5).min(most);
+        }
+    }
 }
 
 /// One client: what it has, and where it looks.
@@ -315,5 +354,42 @@ pub fn uplink_camera(camera: &Camera, origin: DVec3, height_px: u32) -> uplink::
         fov_y_rad: camera.fov_y_rad,
         aspect: camera.aspect,
         height_px,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Frames of a scene where new surfaces take `new` a ray and movers `moving`, until the pace
+    /// settles.
+    fn settle(pace: &mut Pace, new: f32, moving: f32) -> f32 {
+        let mut busy = 0.0;
+        for _ in 0..200 {
+            busy = pace.converge_rays as f32 * new + moving / pace.refresh_steps as f32;
+            pace.after(busy);
+        }
+        busy
+    }
+
+    #[test]
+    fn a_server_under_load_keeps_its_rate_and_takes_up_what_it_left_when_there_is_time() {
+        let mut pace = Pace::default();
+        assert!(settle(&mut pace, 0.0, 3.0) <= 0.8, "{pace:?}");
+        assert_eq!(pace.refresh_steps, 4);
+        settle(&mut pace, 0.0, 0.1);
+        assert_eq!(pace.refresh_steps, 1);
+        // New surfaces alone make no mover wait.
+        settle(&mut pace, 1e-6, 0.1);
+        assert_eq!(pace.refresh_steps, 1);
+        // More than the server can do: all that can wait waits.
+        settle(&mut pace, 1.0, 100.0);
+        assert_eq!(
+            pace,
+            Pace {
+                converge_rays: 1 << 14,
+                refresh_steps: MAX_REFRESH_STEPS
+            }
+        );
     }
 }

@@ -38,8 +38,9 @@ pub struct Options {
     /// Rays a point, 1 to 4096.
     pub rays: usize,
     /// Steps in which each point near what moves is traced once, in turn with its neighbours: 1
-    /// for all of them at every step. What a point says lags by up to one step less; all is up to
-    /// date as many steps after the last move. 0 counts as 1.
+    /// for all of them at every step, 2, 4, or [`MAX_REFRESH_STEPS`] (what is between counts as the
+    /// next higher). What a point says lags by up to one step less; all is up to date as many
+    /// steps after the last move. May be changed between steps.
     pub refresh_steps: u32,
     /// Kernel that the grid is laid out for.
     pub kernel: Kernel,
@@ -129,6 +130,9 @@ const AWAY_M: f32 = 1e7;
 
 /// Most points of a scene: about 90 bytes each.
 pub const MAX_POINTS: u64 = 1 << 26;
+
+/// Most steps in which points may take turns ([`Options::refresh_steps`]).
+pub const MAX_REFRESH_STEPS: u32 = 8;
 
 /// A run of points of one instance in Morton order.
 #[derive(Clone, Debug)]
@@ -585,12 +589,12 @@ impl World {
         self.pose_at(time_s);
         self.mark_stale();
         self.place_deforming(visible);
-        let refresh_steps = self.options.refresh_steps.max(1);
+        let steps = self.options.refresh_steps.clamp(1, MAX_REFRESH_STEPS);
         self.trace(
             visible,
             converge_rays,
             self.options.rays,
-            refresh_steps,
+            MAX_REFRESH_STEPS / steps.next_power_of_two(),
             &|_, _| (),
         )
     }
@@ -605,7 +609,7 @@ impl World {
     ) -> StepStats {
         let mut total = StepStats::default();
         loop {
-            let stats = self.trace(visible, u64::MAX, rays, 1, report);
+            let stats = self.trace(visible, u64::MAX, rays, MAX_REFRESH_STEPS, report);
             total.rays += stats.rays;
             total.points += stats.points;
             if stats.converging == 0 {
@@ -765,13 +769,13 @@ impl World {
     }
 
     /// Traces what is visible and due. Slices with less than `goal` of their rays gain some, as far
-    /// as `converge_rays` goes. The others take `refresh_steps` turns.
+    /// as `converge_rays` goes. Of the points of the others, as many eighths as `shares` says.
     fn trace(
         &mut self,
         visible: &(dyn Fn([Vec3; 2]) -> bool + Sync),
         converge_rays: u64,
         goal: usize,
-        refresh_steps: u32,
+        shares: u32,
         report: &(dyn Fn(u64, u64) + Sync),
     ) -> StepStats {
         let all = self.options.rays;
@@ -806,14 +810,14 @@ impl World {
                 stats.converging += u64::from(rays < goal.min(all));
             }
             if slice.stale {
-                turn.owed = refresh_steps;
+                turn.owed = u8::MAX;
             }
             if rays > slice.rays_done || turn.owed > 0 && rays > 0 {
                 // What comes into view is all due at once, and so are new rays.
                 let share = if rays > slice.rays_done || !followed {
                     turn.all()
                 } else {
-                    turn.next(refresh_steps)
+                    turn.next(shares)
                 };
                 due.push((index, rays, share));
             }
@@ -1269,24 +1273,21 @@ impl std::error::Error for NoInstance {}
 /// Points of a slice that are traced together: few, so that all threads end together.
 const BATCH_POINTS: usize = 128;
 
-/// The points whose number leaves `rest` when divided by `of`.
+/// A set of eighths of a slice's points: those whose numbers end in three bits that are in it.
 #[derive(Clone, Copy, Debug)]
-struct Share {
-    of: u32,
-    rest: u32,
-}
+struct Share(u8);
 
 impl Share {
     fn has(self, number: u32) -> bool {
-        number % self.of == self.rest
+        self.0 >> (number % MAX_REFRESH_STEPS) & 1 != 0
     }
 }
 
-/// Which of a slice's points were traced last, and how many shares are due.
+/// Which eighths of a slice's points are due, and where to go on.
 #[derive(Clone, Copy, Debug, Default)]
 struct Turn {
-    last: u32,
-    owed: u32,
+    owed: u8,
+    next: u32,
     /// The step at which it was visible last.
     seen_at: u64,
 }
@@ -1294,16 +1295,20 @@ struct Turn {
 impl Turn {
     fn all(&mut self) -> Share {
         self.owed = 0;
-        Share { of: 1, rest: 0 }
+        Share(u8::MAX)
     }
 
-    fn next(&mut self, of: u32) -> Share {
-        self.owed -= 1;
-        self.last = (self.last + 1) % of;
-        Share {
-            of,
-            rest: self.last,
+    /// The next `shares` of what is due.
+    fn next(&mut self, shares: u32) -> Share {
+        let mut share = 0u8;
+        for _ in 0..MAX_REFRESH_STEPS {
+            if share.count_ones() < shares {
+                share |= self.owed & 1 << self.next;
+                self.next = (self.next + 1) % MAX_REFRESH_STEPS;
+            }
         }
+        self.owed &= !share;
+        Share(share)
     }
 }
 
