@@ -2941,7 +2941,15 @@ fn levels_of_detail_change_with_the_distance_and_fade() {
         let view = View {
             sees: &all,
             eye: Some(Eye {
-                position: Vec3::new(0.0, far, 0.0),
+                camera: psao_server::camera::Camera {
+                    position: Vec3::new(0.0, far, 0.0),
+                    forward: Vec3::NEG_Y,
+                    up: Vec3::Z,
+                    fov_y_rad: 1.0,
+                    aspect: 1.0,
+                    near: 0.1,
+                    far: 100.0,
+                },
                 pixels_per_radian: 1000.0,
             }),
         };

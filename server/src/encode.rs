@@ -59,8 +59,8 @@ pub struct View<'a> {
 /// Where a client looks from, and how finely.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Eye {
-    /// Relative to the scene's origin, metres.
-    pub position: Vec3,
+    /// Relative to the scene's origin.
+    pub camera: Camera,
     /// Pixels a radian in the middle of the picture; 0 if the client has not said.
     pub pixels_per_radian: f32,
 }
@@ -69,7 +69,7 @@ impl Eye {
     /// Of a camera whose picture has so many rows.
     pub fn of(camera: &Camera, height_px: u32) -> Eye {
         Eye {
-            position: camera.position,
+            camera: *camera,
             pixels_per_radian: height_px as f32 * 0.5 / (camera.fov_y_rad * 0.5).tan(),
         }
     }

@@ -128,7 +128,8 @@ impl View {
     }
 }
 
-fn first_visible(world: &World, mut origin: Vec3, direction: Vec3) -> Option<Fragment> {
+/// What a ray sees: the first surface that is not a single-sided one's back.
+pub fn first_visible(world: &World, mut origin: Vec3, direction: Vec3) -> Option<Fragment> {
     // Bounded: a ray that only ever sees backs sees nothing.
     for _ in 0..64 {
         let hit = world.tracer().closest(origin, direction, f32::INFINITY)?;

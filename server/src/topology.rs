@@ -26,7 +26,12 @@ pub struct PointSet {
     pub coded: Vec<PatchPoint>,
     /// The grid at each level, without a place in the bucket buffer.
     pub levels: Vec<Level>,
+    /// Patches by place: what has points in, or a cell beside, each part of the grid of level 0.
+    parts: HashMap<[u32; 3], Vec<u32>, Fast>,
 }
+
+/// A part is so many cells long, as a power of two.
+const PART_BITS: u32 = 2;
 
 /// A set's grid at a level of detail.
 #[derive(Clone, Copy, Debug, Default)]
@@ -90,6 +95,7 @@ impl PointSet {
             points: Vec::with_capacity(all.len()),
             coded: Vec::with_capacity(all.len()),
             levels: Vec::new(),
+            parts: HashMap::default(),
         };
         for (bytes, chunk) in patches {
             set.patches.push(bytes);
@@ -102,7 +108,35 @@ impl PointSet {
             .into_par_iter()
             .map(|level| lay_out(&set.coded, grid, level))
             .collect();
+        for patch in 0..set.patches.len() {
+            for point in &set.coded[set.patch_range(patch)] {
+                let cell = point.position.map(|steps| steps / 32);
+                let [first, last] = [
+                    cell.map(|c| c.saturating_sub(1) >> PART_BITS),
+                    cell.map(|c| (c + 1) >> PART_BITS),
+                ];
+                for x in first[0]..=last[0] {
+                    for y in first[1]..=last[1] {
+                        for z in first[2]..=last[2] {
+                            let patches = set.parts.entry([x, y, z]).or_default();
+                            if patches.last() != Some(&(patch as u32)) {
+                                patches.push(patch as u32);
+                            }
+                        }
+                    }
+                }
+            }
+        }
         (!set.coded.is_empty()).then_some(set)
+    }
+
+    /// Patches that have points around a local position, and perhaps some that are a little
+    /// farther away.
+    pub fn patches_near(&self, position: Vec3) -> &[u32] {
+        let cells = self.levels[0].grid.to_cells(position.to_array());
+        // What is below 0 becomes 0.
+        let part = cells.map(|c| c as u32 >> PART_BITS);
+        self.parts.get(&part).map_or(&[], Vec::as_slice)
     }
 
     /// The points of a patch, as numbers within the set.

@@ -1109,6 +1109,14 @@ impl World {
         })
     }
 
+    /// In rest space: slices that have points around a place in the space of an instance's grid.
+    pub fn slices_near(&self, instance: u32, position: Vec3) -> impl Iterator<Item = u32> + '_ {
+        let set = self.topology.set_of(instance);
+        let patches = set.map_or(&[][..], |set| set.patches_near(position));
+        let first = self.slices_of(instance).start;
+        patches.iter().map(move |patch| first + patch)
+    }
+
     /// Numbers of an instance's slices.
     pub fn slices_of(&self, instance: u32) -> Range<u32> {
         let carrier = self.carriers[instance as usize].as_ref();

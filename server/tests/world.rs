@@ -505,3 +505,27 @@ fn a_density_that_asks_for_too_much_is_refused_before_memory_is_taken() {
     let error = refused(many, 1.5e6);
     assert!(matches!(error, WorldError::TooManyPoints(_)), "{error}");
 }
+
+#[test]
+fn the_slices_near_a_place_are_those_with_points_there() {
+    let options = Options {
+        rest_space: true,
+        ..options(512.0, 64)
+    };
+    let world = world(small_scene(), options);
+    let mut others = 0;
+    for (index, slice) in world.slices.iter().enumerate() {
+        for number in slice.points.clone().step_by(7) {
+            let (position, _) = world.grid_point(slice.instance, number);
+            let near: Vec<u32> = world.slices_near(slice.instance, position).collect();
+            assert!(
+                near.contains(&(index as u32)),
+                "{position} of slice {index}"
+            );
+            let all = world.slices_of(slice.instance).len();
+            others += usize::from(near.len() < all);
+        }
+    }
+    assert!(others > 0, "every place is near every slice");
+    assert_eq!(world.slices_near(0, Vec3::splat(1e9)).count(), 0);
+}

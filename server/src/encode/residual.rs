@@ -1,6 +1,7 @@
 //! Profile `residual`: patches once, then slices' occlusion, the largest visible error first.
 
-use super::{Compression, FrameStats, View, capacity_of, compress, compressor, write_content};
+use super::{Compression, Eye, FrameStats, View, capacity_of, compress, compressor, write_content};
+use crate::render::{Fragment, first_visible};
 use crate::world::{Slice, World};
 use glam::Vec3;
 use psao::memory::{Heap, SliceHeap};
@@ -42,10 +43,16 @@ impl Limits {
 const PACKET_BYTES: usize = 1 << 18;
 
 /// Points of a slice that are looked for from the camera until one is in sight: when the slice comes
-/// into the frustum, and in every how manieth frame from then on. What is behind walls so waits.
+/// into the frustum, and in every how manieth frame from then on. What is behind walls so waits,
+/// and what is about to come out is found before it shows.
 const FIRST_LOOKS: u32 = 64;
 const LOOKS: u32 = 16;
 const LOOK_EVERY: u64 = 3;
+
+/// Rays through the picture that a frame casts, across and down, as long as slices in the frustum
+/// have not been in sight: what shows between two columns is found the sooner the more of the
+/// picture it fills.
+const PICTURE_LOOKS: [u32; 2] = [32, 18];
 
 /// Slices coded side by side before the budget is looked at again.
 const BATCH: usize = 64;
@@ -70,6 +77,8 @@ pub struct Residual {
     seen: Vec<u64>,
     /// Slices of which something was in sight, not only in the frustum.
     sighted: Vec<bool>,
+    /// Whether all slices in the frustum were, in the last frame.
+    all_sighted: bool,
     frames: u64,
     /// Slices on their way from one level's picture to another's.
     fades: BTreeMap<u32, Fade>,
@@ -138,6 +147,7 @@ impl Residual {
             due: vec![true; world.slices.len()],
             seen: vec![0; world.slices.len()],
             sighted: vec![false; world.slices.len()],
+            all_sighted: false,
             // So that no slice was seen in the frame before the first.
             frames: 1,
             fades: BTreeMap::new(),
@@ -209,7 +219,14 @@ impl Residual {
         };
         let mut out = Frame::default();
         self.drop_absent(world, &mut out);
+        if let Some(eye) = &view.eye
+            && !self.all_sighted
+        {
+            self.look(world, eye);
+        }
         let mut lacks = self.lacks(world, view);
+        let mut in_view = self.seen.iter().zip(&self.sighted);
+        self.all_sighted = in_view.all(|(seen, sighted)| *sighted || *seen < self.frames);
         self.choose_levels(world, view, &lacks, room, &mut out);
         if !out.closes.is_empty() {
             // What changed its level is lacking as a whole now.
@@ -249,6 +266,32 @@ impl Residual {
         out.write(self, world, stats)
     }
 
+    /// Marks slices that the picture shows.
+    fn look(&mut self, world: &World, eye: &Eye) {
+        let [width, height] = PICTURE_LOOKS;
+        let frame = self.frames as u32;
+        let shown: Vec<u32> = (0..width * height)
+            .into_par_iter()
+            .flat_map_iter(|look| {
+                // Somewhere in its part of the picture, evenly over the frames.
+                let own = look.wrapping_mul(0x9e37_79b9);
+                let place = |own: u32, step: u32| {
+                    own.wrapping_add(frame.wrapping_mul(step)) as f32 * 0.5f32.powi(32)
+                };
+                let x = (look % width) as f32 + place(own, 3_242_174_889);
+                let y = (look / width) as f32 + place(own << 16, 2_447_445_414);
+                let (origin, direction) = eye.camera.ray_at(x, y, width, height);
+                let usable = direction.is_finite() && origin.is_finite();
+                let hit = usable.then(|| first_visible(world, origin, direction));
+                let slices = |hit: Fragment| world.slices_near(hit.instance, hit.position);
+                hit.flatten().map(slices).into_iter().flatten()
+            })
+            .collect();
+        for slice in shown {
+            self.sighted[slice as usize] = true;
+        }
+    }
+
     /// The slices in view that the client does not have, or that differ.
     fn lacks(&mut self, world: &World, view: &View<'_>) -> Vec<Lack> {
         let (frames, quantiser) = (self.frames, self.quantiser);
@@ -272,7 +315,7 @@ impl Residual {
                             0 | 1 => 0,
                             _ => FIRST_LOOKS,
                         };
-                        world.is_seen(slice, eye.position, samples, seed)
+                        world.is_seen(slice, eye.camera.position, samples, seed)
                     });
                     if !*sighted {
                         return None;
@@ -305,9 +348,9 @@ impl Residual {
                     *due = false;
                     return None;
                 }
-                let near = view
-                    .eye
-                    .map_or(1.0, |eye| distance(eye.position, slice.bounds).max(0.5));
+                let near = view.eye.map_or(1.0, |eye| {
+                    distance(eye.camera.position, slice.bounds).max(0.5)
+                });
                 Some(Lack {
                     index: index as u32,
                     opens,
@@ -349,7 +392,7 @@ impl Residual {
             if self.seen[index] == self.frames {
                 let far = view
                     .eye
-                    .map_or(0.0, |eye| distance(eye.position, slice.bounds));
+                    .map_or(0.0, |eye| distance(eye.camera.position, slice.bounds));
                 let least = nearest.entry(slice.instance).or_insert(f32::INFINITY);
                 *least = least.min(far);
             }
