@@ -97,7 +97,9 @@ pub unsafe extern "system" fn Java_org_psao_NativeConnection_open<'a>(
         };
         // SAFETY: the module's rules: there are two words.
         unsafe {
-            at::<jlong>(words).add(1).write_unaligned(connection as jlong);
+            at::<jlong>(words)
+                .add(1)
+                .write_unaligned(connection as jlong);
             answer(env, words, result as jlong, &text)
         }
     });
