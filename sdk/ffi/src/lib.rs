@@ -8,6 +8,9 @@
 //! ```
 #![allow(non_camel_case_types)]
 
+// Its constants are the first in the header.
+mod version;
+
 mod client;
 #[cfg(feature = "quic")]
 mod connection;
@@ -17,7 +20,6 @@ mod result;
 mod sync;
 mod types;
 mod uplink;
-mod version;
 
 pub use client::*;
 #[cfg(feature = "quic")]

@@ -50,4 +50,11 @@ public final class PsaoBuffer {
     public ByteBuffer bytes() {
         return bytes;
     }
+
+    /** Refuses memory that native code would read from and write to at once. */
+    static void checkApart(PsaoBuffer input, long inputBytes, long output, long outputBytes) {
+        if (input.address < output + outputBytes && output < input.address + inputBytes) {
+            throw new IllegalArgumentException("input and output share memory: use two buffers");
+        }
+    }
 }

@@ -273,7 +273,8 @@ public final class PsaoClient implements AutoCloseable {
      *     positions outside and numbers that are none answer 1
      * @throws PsaoException {@link PsaoResult#ERROR_ORDER}: no frame is taken.
      *     {@link PsaoResult#ERROR_VALUE}: a buffer's memory is not aligned to 4 bytes
-     * @throws IllegalArgumentException if count is below 0, or a buffer is too short
+     * @throws IllegalArgumentException if count is below 0, a buffer is too short, or outOpenness
+     *     shares memory with another one
      * @throws IllegalStateException if it is closed, or another thread is in the taker's part
      */
     public void lookup(
@@ -286,6 +287,8 @@ public final class PsaoClient implements AutoCloseable {
             throw new IllegalArgumentException(count + " points need 12 bytes each in positions "
                     + "and normals, and 4 in outOpenness");
         }
+        PsaoBuffer.checkApart(positions, bytes, outOpenness.address, bytes / 3);
+        PsaoBuffer.checkApart(normals, bytes, outOpenness.address, bytes / 3);
         enter(taker);
         try {
             PsaoException.check(Native.lookup(

@@ -35,7 +35,8 @@ public final class PsaoUplink {
         byte[] bytes = token.getBytes(Charset.forName("UTF-8"));
         int from = out.bytes().position();
         written(out, from, Native.hello(
-                counter.address, config.words(), bytes, topologyHash, out.address + from, room(out, from), this));
+                counter.address, config.words(), bytes, topologyHash, out.address + from,
+                room(out, from), this));
     }
 
     /**
@@ -67,7 +68,8 @@ public final class PsaoUplink {
         int from = out.bytes().position();
         written(out, from, Native.camera(
                 counter.address, fovYRad, aspect, heightPx, positionXM, positionYM, positionZM,
-                forwardX, forwardY, forwardZ, upX, upY, upZ, out.address + from, room(out, from), this));
+                forwardX, forwardY, forwardZ, upX, upY, upZ, out.address + from,
+                room(out, from), this));
     }
 
     /**
@@ -88,7 +90,8 @@ public final class PsaoUplink {
         }
         int from = out.bytes().position();
         written(out, from, Native.transform(
-                counter.address, instanceIndex, worldFromLocal, out.address + from, room(out, from), this));
+                counter.address, instanceIndex, worldFromLocal, out.address + from,
+                room(out, from), this));
     }
 
     /**
@@ -102,7 +105,8 @@ public final class PsaoUplink {
      * @throws PsaoException {@link PsaoResult#ERROR_VALUE}: a number is not finite, the buffer's
      *     memory is not aligned to 4 bytes, or there are too many joints.
      *     {@link PsaoResult#ERROR_OUTPUT_SIZE}: out has too little room
-     * @throws IllegalArgumentException if the count is below 0, or the buffer too short
+     * @throws IllegalArgumentException if the count is below 0, the buffer too short, or out
+     *     shares memory with it
      */
     public void joints(
             int instanceIndex, PsaoBuffer localFromRest, int jointCount, PsaoBuffer out) {
@@ -110,9 +114,11 @@ public final class PsaoUplink {
             throw new IllegalArgumentException(jointCount + " joints need 48 bytes each");
         }
         int from = out.bytes().position();
+        PsaoBuffer.checkApart(
+                localFromRest, 48L * jointCount, out.address + from, room(out, from));
         written(out, from, Native.joints(
-                counter.address, instanceIndex, localFromRest.address, jointCount, out.address + from,
-                room(out, from), this, localFromRest));
+                counter.address, instanceIndex, localFromRest.address, jointCount,
+                out.address + from, room(out, from), this, localFromRest));
     }
 
     /**
@@ -128,7 +134,8 @@ public final class PsaoUplink {
     public void presence(int instanceIndex, boolean present, PsaoBuffer out) {
         int from = out.bytes().position();
         written(out, from, Native.presence(
-                counter.address, instanceIndex, present ? 1 : 0, out.address + from, room(out, from), this));
+                counter.address, instanceIndex, present ? 1 : 0, out.address + from,
+                room(out, from), this));
     }
 
     /**
@@ -140,7 +147,8 @@ public final class PsaoUplink {
      */
     public void ack(int frameId, PsaoBuffer out) {
         int from = out.bytes().position();
-        written(out, from, Native.ack(counter.address, frameId, out.address + from, room(out, from), this));
+        written(out, from, Native.ack(
+                counter.address, frameId, out.address + from, room(out, from), this));
     }
 
     /**
@@ -151,7 +159,8 @@ public final class PsaoUplink {
      */
     public void resync(PsaoBuffer out) {
         int from = out.bytes().position();
-        written(out, from, Native.resync(counter.address, out.address + from, room(out, from), this));
+        written(out, from, Native.resync(
+                counter.address, out.address + from, room(out, from), this));
     }
 
     /** Of a position that was read once, so that no thread can make it more than there is. */
