@@ -312,6 +312,34 @@ fn the_examples_build_with_a_compiler_alone_with_pkg_config_and_with_cmake() {
     run(Command::new(build.join("play")).args([cells, &picture]));
 }
 
+/// Mesa's software GLES, without a window.
+#[test]
+fn the_android_samples_file_uploads_what_changed_and_its_shader_agrees_with_the_cpu() {
+    let setup = &*SETUP;
+    let program = setup.folder.join("sample");
+    run(Command::new("cc")
+        .args(WARNINGS)
+        .arg("-std=c99")
+        .arg("-I")
+        .arg(setup.prefix.join("include"))
+        .arg("-I")
+        .arg(root().join("android/sample/src/main/cpp"))
+        .arg(root().join("tests/c/sample.c"))
+        .arg(root().join("android/sample/src/main/cpp/psao_ao.c"))
+        .arg(setup.prefix.join("lib/libpsao.a"))
+        .args(["-lEGL", "-lGLESv2", "-lpthread", "-ldl", "-lm", "-o"])
+        .arg(&program));
+    // Where the shaders are not in the tree yet, only the uploads can be looked at.
+    let shaders = root().join("sdk/shaders");
+    let snippet = shaders.join("generated/psao_es310.glsl");
+    for stream in ["cells", "residual"] {
+        let stream = root().join(format!("tests/conformance/streams/{stream}.psao"));
+        run(Command::new(&program)
+            .arg(stream)
+            .args(shaders.exists().then_some(&snippet)));
+    }
+}
+
 #[test]
 fn the_shared_library_exports_the_listed_functions_and_nothing_else() {
     let library = SETUP.prefix.join("lib/libpsao.so");

@@ -60,13 +60,19 @@ static SETUP: LazyLock<Setup> = LazyLock::new(|| {
         .current_dir(root())
         .args(["build", "--locked", "-p", "psao-jni"])
         .args(["--features", "provoke,quic", "--message-format", "json"]));
-    let library = messages.split('"').rfind(|part| part.ends_with("/libpsao_jni.so"));
+    let library = messages
+        .split('"')
+        .rfind(|part| part.ends_with("/libpsao_jni.so"));
     let library = Path::new(library.unwrap()).parent().unwrap().to_path_buf();
     let documented = ["-Xdoclint:all/protected"];
     javac(&classes, sources("android/api/core/org/psao"), &documented);
     // The Android part, against the few classes of Android that it uses, as the tests declare them.
     javac(&classes, sources("tests/jni/android"), &[]);
-    javac(&classes, sources("android/api/android/org/psao/android"), &documented);
+    javac(
+        &classes,
+        sources("android/api/android/org/psao/android"),
+        &documented,
+    );
     javac(&classes, sources("tests/jni"), &[]);
     javac(&classes, sources("android/desktop"), &[]);
     Setup { classes, library }
@@ -265,4 +271,136 @@ fn the_desktop_sample_plays_a_recording_and_writes_a_picture() {
     // What is none is said to be none.
     let other = java("Play").arg(file!()).arg(&picture).output().unwrap();
     assert!(!other.status.success());
+}
+
+#[test]
+fn the_aar_is_the_same_byte_for_byte_and_has_what_an_app_needs() {
+    let setup = &*SETUP;
+    let folder = tempfile::tempdir().unwrap();
+    let abis = ["arm64-v8a", "x86_64"];
+    for abi in abis {
+        // What is in it does not matter here: tests/android-link makes one for Android.
+        let to = folder.path().join("natives").join(abi);
+        std::fs::create_dir_all(&to).unwrap();
+        std::fs::copy(
+            setup.library.join("libpsao_jni.so"),
+            to.join("libpsao_jni.so"),
+        )
+        .unwrap();
+    }
+    let assemble = |out: &Path| {
+        let mut command = Command::new(root().join("android/assemble-aar"));
+        command.arg(folder.path().join("natives")).arg(out);
+        command.env_remove("ANDROID_JAR");
+        command
+    };
+    let aars = ["one.aar", "other.aar"].map(|name| folder.path().join(name));
+    for aar in &aars {
+        run(&mut assemble(aar));
+    }
+    let [one, other] = aars.each_ref().map(|aar| std::fs::read(aar).unwrap());
+    assert!(one == other, "two runs, two results");
+
+    let out = folder.path().join("out");
+    run(Command::new("unzip")
+        .arg("-q")
+        .arg(&aars[0])
+        .arg("-d")
+        .arg(&out));
+    let listed = run(Command::new("unzip").arg("-Z1").arg(&aars[0]));
+    let mut expected = vec![
+        "AndroidManifest.xml".to_string(),
+        "META-INF/com/android/build/gradle/aar-metadata.properties".into(),
+        "R.txt".into(),
+        "classes.jar".into(),
+    ];
+    expected.extend(abis.map(|abi| format!("jni/{abi}/libpsao_jni.so")));
+    let module = "prefab/modules/psao";
+    expected.push(format!("{module}/include/psao.h"));
+    for abi in abis {
+        expected.push(format!("{module}/libs/android.{abi}/abi.json"));
+        expected.push(format!("{module}/libs/android.{abi}/libpsao_jni.so"));
+    }
+    expected.push(format!("{module}/module.json"));
+    expected.push("prefab/prefab.json".into());
+    expected.push("proguard.txt".into());
+    assert_eq!(listed.lines().collect::<Vec<_>>(), expected);
+    for name in expected.iter().filter(|name| name.ends_with(".json")) {
+        let json = std::fs::read(out.join(name)).unwrap();
+        let json: serde_json::Value = serde_json::from_slice(&json).unwrap();
+        assert!(json.is_object(), "{name}");
+        if let Some(abi) = json.get("abi") {
+            assert!(
+                name.contains(abi.as_str().unwrap()) && json["api"] == 24,
+                "{json}"
+            );
+        }
+    }
+    let classes = out.join("classes.jar");
+    let listed = run(Command::new("unzip").arg("-Z1").arg(&classes));
+    let other = listed.lines().filter(|name| !name.starts_with("org/psao/"));
+    assert_eq!(other.collect::<Vec<_>>(), [""; 0], "no class but ours");
+    for name in [
+        "org/psao/PsaoClient.class",
+        "org/psao/android/PsaoAssets.class",
+    ] {
+        assert!(listed.lines().any(|line| line == name), "{listed}");
+    }
+    // Java 8's bytecode, which every Android build tool reads.
+    let class = Command::new("unzip")
+        .arg("-p")
+        .arg(&classes)
+        .arg("org/psao/PsaoClient.class")
+        .output()
+        .unwrap();
+    assert_eq!(class.stdout[..8], [0xca, 0xfe, 0xba, 0xbe, 0, 0, 0, 52]);
+
+    // Without a library there is nothing to assemble, and it says so.
+    std::fs::remove_dir_all(folder.path().join("natives")).unwrap();
+    std::fs::create_dir(folder.path().join("natives")).unwrap();
+    let output = assemble(&aars[0]).output().unwrap();
+    let error = String::from_utf8_lossy(&output.stderr);
+    assert!(
+        !output.status.success() && error.contains("arm64-v8a/libpsao_jni.so"),
+        "{error}"
+    );
+}
+
+#[test]
+fn the_native_library_exports_the_c_abi_and_what_java_calls_and_nothing_else() {
+    let library = SETUP.library.join("libpsao_jni.so");
+    let symbols = run(Command::new("nm")
+        .args(["-D", "--defined-only", "-j"])
+        .arg(library));
+    let mut symbols: Vec<String> = symbols.lines().map(String::from).collect();
+    symbols.sort_unstable();
+    let mut expected: Vec<String> = include_str!("../sdk/ffi/exports.txt")
+        .lines()
+        .map(String::from)
+        .collect();
+    expected.extend(["open", "receive", "send", "close"].map(|n| format!("psao_connection_{n}")));
+    for (class, source) in [
+        (
+            "Native",
+            include_str!("../android/api/core/org/psao/Native.java"),
+        ),
+        (
+            "NativeConnection",
+            include_str!("../android/api/core/org/psao/NativeConnection.java"),
+        ),
+        ("Provoke", include_str!("jni/Provoke.java")),
+    ] {
+        for line in source.lines().filter(|line| line.contains(" native ")) {
+            let name = line
+                .split('(')
+                .next()
+                .unwrap()
+                .split(' ')
+                .next_back()
+                .unwrap();
+            expected.push(format!("Java_org_psao_{class}_{name}"));
+        }
+    }
+    expected.sort_unstable();
+    assert_eq!(symbols, expected);
 }
