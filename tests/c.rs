@@ -314,18 +314,19 @@ fn the_examples_build_with_a_compiler_alone_with_pkg_config_and_with_cmake() {
 
 /// Mesa's software GLES, without a window.
 #[test]
-fn the_android_samples_file_uploads_what_changed_and_its_shader_agrees_with_the_cpu() {
+fn the_android_sample_uploads_what_changed_and_its_shader_agrees_with_the_cpu() {
     let setup = &*SETUP;
     let program = setup.folder.join("sample");
+    let sample = root().join("android/sample/src/main/cpp");
     run(Command::new("cc")
         .args(WARNINGS)
-        .arg("-std=c99")
+        .arg("-std=c11")
         .arg("-I")
         .arg(setup.prefix.join("include"))
         .arg("-I")
-        .arg(root().join("android/sample/src/main/cpp"))
+        .arg(&sample)
         .arg(root().join("tests/c/sample.c"))
-        .arg(root().join("android/sample/src/main/cpp/psao_ao.c"))
+        .args(["psao_ao.c", "player.c"].map(|name| sample.join(name)))
         .arg(setup.prefix.join("lib/libpsao.a"))
         .args(["-lEGL", "-lGLESv2", "-lpthread", "-ldl", "-lm", "-o"])
         .arg(&program));

@@ -3,10 +3,12 @@
  *
  *     sample RECORDING.psao [SNIPPET.glsl]
  */
+#define _POSIX_C_SOURCE 200809L
 #include "common.h"
 #include <EGL/egl.h>
 #include <EGL/eglext.h>
 #include <math.h>
+#include <player.h>
 #include <psao_ao.h>
 
 enum { SIZE = 64 };
@@ -124,6 +126,25 @@ static int step(psao_client *client, bytes stream, size_t *done) {
     return 0;
 }
 
+/* The sample's other thread. */
+static void check_player(psao_ao *ao, bytes stream) {
+    const uint8_t nonsense[100] = {0};
+    player player;
+    GIVES(PSAO_ERROR_NOT_A_STREAM, player_open(&player, nonsense, sizeof nonsense, SIZE_MAX));
+    player_close(&player);
+    GIVES(PSAO_ERROR_MEMORY_SIZE, player_open(&player, stream.data, stream.size, 1000));
+    player_close(&player);
+    GIVES(PSAO_OK, player_open(&player, stream.data, stream.size, SIZE_MAX));
+    psao_result result = PSAO_NOTHING_NEW;
+    for (unsigned last = 0; last < 3; last = ao->frame_id) {
+        result = psao_ao_update(ao, player.client);
+        CHECK(result >= 0 && player.result >= 0);
+    }
+    player_pause(&player, 1);
+    player_close(&player);
+    GLES_OK();
+}
+
 int main(int count, char **words) {
     CHECK(count == 2 || count == 3);
     bytes stream = read_file(words[1]);
@@ -197,6 +218,7 @@ int main(int count, char **words) {
         done = word_done = 0;
     }
     CHECK(frames > 2);
+    check_player(&ao, stream);
     /* Frames after the first bring less than all of it. */
     uint64_t whole = (uint64_t)(ao.bytes[0] + ao.bytes[1] + ao.bytes[2]);
     CHECK(later_bytes > 0 && later_bytes < whole * (frames / 2 - 1));

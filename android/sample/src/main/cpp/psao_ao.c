@@ -57,6 +57,8 @@ psao_result psao_ao_update(psao_ao *ao, psao_client *client) {
         result = upload(ao, client, buffer, elements[buffer], counts[buffer]);
     ao->kernel = (GLint)frame.kernel;
     ao->frame_id = frame.frame_id;
+    if (frame.instance_count > 0)
+        ao->first = frame.instances[0];
     /* GLES has copied what was passed to it. */
     psao_result released = psao_client_release(client);
     return result < 0 ? result : released;

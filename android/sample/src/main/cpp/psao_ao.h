@@ -43,6 +43,8 @@ typedef struct psao_ao {
     /* Of the last frame; -1: none has come yet. */
     GLint kernel;
     uint32_t frame_id;
+    /* The first instance's grid in that frame, for apps that place something by it. */
+    psao_instance first;
     /* Of the last update that brought something. */
     uint32_t upload_count;
     uint64_t uploaded_bytes;
