@@ -12,8 +12,8 @@ public interface PsaoLog {
     /**
      * Takes a message. Called on the thread of the function that has something to say, and only
      * from the constructor of {@link PsaoClient} and from {@link PsaoClient#restart}; a thread of
-     * native code's own is attached to the virtual machine until it ends. What this throws is
-     * dropped.
+     * native code's own is attached to the virtual machine until it ends. It must not use the
+     * client. What it throws is dropped.
      *
      * @param level {@link #ERROR}, {@link #WARNING} or {@link #INFO}
      * @param message a sentence
