@@ -2,8 +2,7 @@
 
 use crate::connection::*;
 use crate::native::{at, config, count};
-use crate::result::psao_result::{self, *};
-use crate::types::*;
+use crate::result::psao_result;
 use jni::errors::{Error, ThrowRuntimeExAndDefault};
 use jni::objects::{JByteArray, JClass, JLongArray, JObject, JString};
 use jni::sys::{jint, jlong};
