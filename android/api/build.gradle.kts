@@ -22,8 +22,8 @@ android {
     }
     sourceSets["main"].apply {
         manifest.srcFile("AndroidManifest.xml")
-        java.setSrcDirs(listOf("core", "android"))
-        jniLibs.setSrcDirs(listOf(natives))
+        java.directories += listOf("core", "android")
+        jniLibs.directories += "jniLibs"
     }
 }
 

@@ -24,7 +24,7 @@ val assets = tasks.register<Sync>("collectAssets") {
     from("../../sdk/shaders/generated/psao_es310.glsl")
     into(layout.buildDirectory.dir("psao-assets"))
 }
-android.sourceSets["main"].assets.srcDir(layout.buildDirectory.dir("psao-assets"))
+android.sourceSets["main"].assets.directories += "build/psao-assets"
 tasks.named("preBuild") { dependsOn(assets) }
 
 dependencies {
