@@ -122,7 +122,7 @@ pub(crate) fn guarded(body: impl FnOnce() -> Result<psao_result, psao_result>) -
 ///
 /// # Safety
 /// `client` is NULL or a live client.
-unsafe fn with(
+pub(crate) unsafe fn with(
     client: *const psao_client,
     body: impl FnOnce(&psao_client) -> Result<psao_result, psao_result>,
 ) -> psao_result {

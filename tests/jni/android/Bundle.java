@@ -1,0 +1,4 @@
+package android.os;
+
+/** As far as org.psao.android uses it. */
+public class Bundle {}
