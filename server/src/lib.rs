@@ -6,6 +6,8 @@ pub mod commands;
 pub mod demo;
 pub mod encode;
 pub mod eval;
+#[cfg(feature = "gpu")]
+pub mod gpu;
 pub mod identity;
 pub mod metrics;
 pub mod picture;
