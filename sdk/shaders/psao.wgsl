@@ -1,0 +1,232 @@
+// PSAO: the lookup, for any engine. Blends the points around a fragment into its openness: 1 is
+// open, 0 fully occluded. The CPU's lookup (sdk/core/src/lookup.rs) is the definition; these
+// functions agree with it to 1/255.
+//
+// What to call:
+//     psao_planar(instance, position, normal)    the default kernel
+//     psao_paper(instance, position, normal)     Neff et al., Eq. 2 to 4
+// Ask the stream's header which of the two its points were made for.
+//     instance    index into the instance buffer; below the buffer's capacity
+//     position    in the instance's local space (rest space where it is skinned or morphed), in
+//                 local units. It must come from the vertices' own positions, as a varying. Never
+//                 subtract it from a world position: f32 does not hold both far from the origin.
+//     normal      in the same space, of any length, on the side of the surface that is seen
+// Both finite.
+//
+// What it reads: three functions that a shim defines (storage.wgsl or texel.wgsl, or your own):
+// the index-th 16 bytes of the instance, bucket and cell buffer, as four words.
+//     fn psao_load_instance(index: u32) -> vec4<u32>
+//     fn psao_load_bucket(index: u32) -> vec4<u32>
+//     fn psao_load_cell(index: u32) -> vec4<u32>
+// Nothing else: no bindings, no derivatives, no texture filters, no subgroups. Any stage will do.
+
+// Points whose normal differs more than this from the fragment's (as a dot product) do not count.
+const PSAO_T_N: f32 = 0.1;
+// `paper`: points that lie this much above or below their own plane do not count.
+const PSAO_T_D: f32 = 0.7;
+// `planar`: half-width of the band around the plane, in radii.
+const PSAO_PLANE_BAND: f32 = 0.3;
+// Larger than any distance in a block of cells.
+const PSAO_FAR: f32 = 1e30;
+
+// An instance's grid and hash table: the 64 bytes of an instance.
+struct PsaoGrid {
+    origin: vec3<f32>,
+    // Interpolation radius, in cells.
+    radius: f32,
+    cells_per_unit: vec3<f32>,
+    bucket_first: u32,
+    dims: vec3<u32>,
+    // 0: the instance has no points.
+    bucket_count: u32,
+    normal_scale: vec3<f32>,
+}
+
+// A fragment seen from the 2×2×2 cells nearest to it: the block.
+struct PsaoFragment {
+    // The block's lower cell, −1 at least.
+    base: vec3<i32>,
+    // The fragment's place seen from it, in cells: 0.5 to 1.5.
+    place: vec3<f32>,
+    // Unit length, or zero, in cell space.
+    normal: vec3<f32>,
+    // Outside the grid, or without points: it is open.
+    outside: bool,
+}
+
+fn psao_grid(instance: u32) -> PsaoGrid {
+    let a = psao_load_instance(instance * 4u);
+    let b = psao_load_instance(instance * 4u + 1u);
+    let c = psao_load_instance(instance * 4u + 2u);
+    let d = psao_load_instance(instance * 4u + 3u);
+    return PsaoGrid(
+        bitcast<vec3<f32>>(a.xyz),
+        bitcast<f32>(a.w),
+        bitcast<vec3<f32>>(b.xyz),
+        b.w,
+        c.xyz,
+        c.w,
+        bitcast<vec3<f32>>(d.xyz),
+    );
+}
+
+fn psao_fragment(grid: PsaoGrid, position: vec3<f32>, normal: vec3<f32>) -> PsaoFragment {
+    let g = (position - grid.origin) * grid.cells_per_unit;
+    let inside = all(g >= vec3<f32>(-0.5)) && all(g < vec3<f32>(grid.dims) + 0.5);
+    // Clamped, so that no float is too large for the integer it becomes.
+    let lower = floor(clamp(g, vec3<f32>(-0.5), vec3<f32>(grid.dims) + 0.5) - 0.5);
+    // Divided by the largest first, so that no square over- or underflows.
+    let largest = max(max(abs(normal.x), abs(normal.y)), abs(normal.z));
+    let n = normal / max(largest, 1e-37) * grid.normal_scale;
+    let squared = dot(n, n);
+    return PsaoFragment(
+        vec3<i32>(lower),
+        g - lower,
+        n * select(0.0, inverseSqrt(squared), squared > 0.0),
+        grid.bucket_count == 0u || !inside,
+    );
+}
+
+// x + y·Dx·weight_y + z·Dx·Dy·weight_z, wrapping.
+fn psao_weigh(grid: PsaoGrid, cell: vec3<u32>, weight_y: u32, weight_z: u32) -> u32 {
+    return cell.x + cell.y * grid.dims.x * weight_y
+        + cell.z * (grid.dims.x * grid.dims.y) * weight_z;
+}
+
+// The index of the cell at a grid coordinate, 0 if there is none: hash (Eq. 1), then search its
+// bucket for the key.
+fn psao_find(grid: PsaoGrid, cell: vec3<u32>) -> u32 {
+    let key = psao_weigh(grid, cell, 1u, 1u);
+    let bucket = grid.bucket_first + psao_weigh(grid, cell, 17u, 31u) % grid.bucket_count;
+    for (var i = 0u; i < 8u; i += 1u) {
+        let entry = psao_load_bucket(bucket * 2u + (i >> 2u))[i & 3u];
+        if entry == 0u {
+            break;
+        }
+        if psao_load_cell(entry * 2u).x == key {
+            return entry;
+        }
+    }
+    return 0u;
+}
+
+// A point's place in its cell, in cells: the middle of its 1/32 step.
+fn psao_point_place(point: u32) -> vec3<f32> {
+    let steps = vec3<u32>(point >> 16u, point >> 21u, point >> 26u) & vec3<u32>(31u);
+    return (vec3<f32>(steps) + 0.5) * 0.03125;
+}
+
+// A point's unit normal in cell space: octahedral, 15 levels an axis.
+fn psao_point_normal(point: u32) -> vec3<f32> {
+    let codes = vec2<u32>(point >> 8u, point >> 12u) & vec2<u32>(15u);
+    let uv = (vec2<f32>(min(codes, vec2<u32>(14u))) - 7.0) / 7.0;
+    let z = 1.0 - abs(uv.x) - abs(uv.y);
+    let folded = (1.0 - abs(uv.yx)) * select(vec2<f32>(1.0), vec2<f32>(-1.0), uv < vec2<f32>(0.0));
+    return normalize(vec3<f32>(select(folded, uv, z >= 0.0), z));
+}
+
+fn psao_point_openness(point: u32) -> f32 {
+    return f32(point & 255u) * (1.0 / 255.0);
+}
+
+// Weight of a point at `d` from the fragment. Eq. 2 and 3.
+fn psao_paper_weight(radius: f32, normal: vec3<f32>, d: vec3<f32>, point_normal: vec3<f32>) -> f32 {
+    let squared = dot(d, d);
+    let along = dot(point_normal, d);
+    if dot(point_normal, normal) <= PSAO_T_N
+        || (along * along >= PSAO_T_D * squared && squared > 0.0) {
+        return 0.0;
+    }
+    return max((radius - sqrt(squared)) / radius, 0.0);
+}
+
+// Weight of a point at `d` from the fragment: nearness, flatness and agreement of the normals.
+fn psao_planar_weight(
+    radius: f32,
+    normal: vec3<f32>,
+    d: vec3<f32>,
+    point_normal: vec3<f32>,
+) -> f32 {
+    let agree = dot(point_normal, normal);
+    if agree <= PSAO_T_N {
+        return 0.0;
+    }
+    let h = max(abs(dot(normal, d)), abs(dot(point_normal, d)));
+    let band = PSAO_PLANE_BAND * radius;
+    let near = max(1.0 - dot(d, d) / (radius * radius), 0.0);
+    let flatness = max(1.0 - h * h / (band * band), 0.0);
+    let agree2 = agree * agree;
+    let agree4 = agree2 * agree2;
+    return near * flatness * agree4 * agree4;
+}
+
+// The blend, written plainly: each of the 8 cells is found, each of its points weighed.
+fn psao_blend(planar: bool, instance: u32, position: vec3<f32>, normal: vec3<f32>) -> f32 {
+    let grid = psao_grid(instance);
+    let fragment = psao_fragment(grid, position, normal);
+    if fragment.outside {
+        return 1.0;
+    }
+    var weights = 0.0;
+    var sum = 0.0;
+    var nearest = 1.0;
+    var nearest_squared = PSAO_FAR;
+    for (var corner = 0u; corner < 8u; corner += 1u) {
+        let offset = vec3<u32>(corner, corner >> 1u, corner >> 2u) & vec3<u32>(1u);
+        // −1 becomes a large number: below the grid is out of range too.
+        let cell = vec3<u32>(fragment.base) + offset;
+        if any(cell >= grid.dims) {
+            continue;
+        }
+        let found = psao_find(grid, cell);
+        if found == 0u {
+            continue;
+        }
+        let corner_from = vec3<f32>(offset) - fragment.place;
+        for (var i = 1u; i < 8u; i += 1u) {
+            let point = psao_load_cell(found * 2u + (i >> 2u))[i & 3u];
+            if point == 0u {
+                break;
+            }
+            if point < 0x80000000u {
+                continue;
+            }
+            let d = corner_from + psao_point_place(point);
+            let point_normal = psao_point_normal(point);
+            let openness = psao_point_openness(point);
+            let squared = dot(d, d);
+            if squared < nearest_squared {
+                nearest_squared = squared;
+                nearest = openness;
+            }
+            var weight = 0.0;
+            if planar {
+                weight = psao_planar_weight(grid.radius, fragment.normal, d, point_normal);
+            } else {
+                weight = psao_paper_weight(grid.radius, fragment.normal, d, point_normal);
+            }
+            weights += weight;
+            sum += weight * openness;
+        }
+    }
+    if weights > 0.0 {
+        return min(sum / weights, 1.0);
+    }
+    return select(1.0, nearest, planar);
+}
+
+// (1 − d²/r²) · max(0, 1 − (h/0.3r)²) · max(0, n·nₚ)⁸ with h = max(|n·d|, |nₚ·d|); where no point
+// counts, the nearest one.
+fn psao_planar(instance: u32, position: vec3<f32>, normal: vec3<f32>) -> f32 {
+    return psao_blend(true, instance, position, normal);
+}
+
+// The paper's Eq. 2 to 4; open where no point counts.
+fn psao_paper(instance: u32, position: vec3<f32>, normal: vec3<f32>) -> f32 {
+    return psao_blend(false, instance, position, normal);
+}
+
+// `psao_planar` in fewer steps.
+fn psao_planar_fast(instance: u32, position: vec3<f32>, normal: vec3<f32>) -> f32 {
+    return psao_blend(true, instance, position, normal);
+}
