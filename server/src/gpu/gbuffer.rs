@@ -259,7 +259,9 @@ impl Renderer {
         );
         let empty = vec![[Vec3::ZERO; 2]; count as usize];
         let mut renderer = Renderer {
-            pipelines: (0..6).map(|kind| pipeline(gpu, &shader, &layout, kind)).collect(),
+            pipelines: (0..6)
+                .map(|kind| pipeline(gpu, &shader, &layout, kind))
+                .collect(),
             binding,
             shapes: gpu.filled("vertices", &shapes, vertex)?,
             uvs: gpu.filled("texture coordinates", &uvs, vertex)?,
@@ -300,15 +302,22 @@ impl Renderer {
                 unused: 0,
             });
         }
-        gpu.queue.write_buffer(&self.placed, 0, bytemuck::cast_slice(&placed));
+        gpu.queue
+            .write_buffer(&self.placed, 0, bytemuck::cast_slice(&placed));
         let (mut positions, mut normals) = (Vec::new(), Vec::new());
         for bent in &self.bent {
             let instance = bent.instance as usize;
-            scene.deform(instance, &pose.instances[instance], &mut positions, &mut normals);
+            scene.deform(
+                instance,
+                &pose.instances[instance],
+                &mut positions,
+                &mut normals,
+            );
             let both = positions.iter().zip(&normals);
             let vertices: Vec<Vertex> = both.map(|(p, n)| [*p, *n]).collect();
             let at = bent.vertices.start * VERTEX_BYTES;
-            gpu.queue.write_buffer(&self.posed, at, bytemuck::cast_slice(&vertices));
+            gpu.queue
+                .write_buffer(&self.posed, at, bytemuck::cast_slice(&vertices));
         }
     }
 
@@ -323,7 +332,8 @@ impl Renderer {
     ) {
         into.camera = Eye::of(camera);
         for eye in [&self.eye, &into.eye] {
-            gpu.queue.write_buffer(eye, 0, bytemuck::bytes_of(&into.camera));
+            gpu.queue
+                .write_buffer(eye, 0, bytemuck::bytes_of(&into.camera));
         }
         let views = [&into.position, &into.normal, &into.world, &into.depth]
             .map(|texture| texture.create_view(&Default::default()));
@@ -371,7 +381,9 @@ impl Renderer {
             let shape = self.shapes.slice(bytes(&mesh.vertices, VERTEX_BYTES));
             let posed = bent
                 .next_if(|bent| bent.instance as usize == index)
-                .map_or(shape, |bent| self.posed.slice(bytes(&bent.vertices, VERTEX_BYTES)));
+                .map_or(shape, |bent| {
+                    self.posed.slice(bytes(&bent.vertices, VERTEX_BYTES))
+                });
             pass.set_pipeline(&self.pipelines[self.kind(instance.mesh, self.flags[index])]);
             pass.set_vertex_buffer(0, posed);
             pass.set_vertex_buffer(1, if self.rest_space { shape } else { posed });
@@ -389,13 +401,20 @@ impl Renderer {
             MIRRORED => 1,
             _ => 2,
         };
-        sides + if self.masks.of_mesh[mesh as usize] != 0 { 3 } else { 0 }
+        sides
+            + if self.masks.of_mesh[mesh as usize] != 0 {
+                3
+            } else {
+                0
+            }
     }
 }
 
 /// Largest local coordinates.
 fn extent(mesh: &Mesh) -> Vec3 {
-    mesh.positions.iter().fold(Vec3::ZERO, |most, p| most.max(p.abs()))
+    mesh.positions
+        .iter()
+        .fold(Vec3::ZERO, |most, p| most.max(p.abs()))
 }
 
 fn layout(gpu: &Gpu) -> wgpu::BindGroupLayout {
@@ -410,15 +429,16 @@ fn layout(gpu: &Gpu) -> wgpu::BindGroupLayout {
         count: None,
     };
     let storage = wgpu::BufferBindingType::Storage { read_only: true };
-    gpu.device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor {
-        label: Some("G-buffer"),
-        entries: &[
-            entry(0, wgpu::BufferBindingType::Uniform),
-            entry(1, storage),
-            entry(2, storage),
-            entry(3, storage),
-        ],
-    })
+    gpu.device
+        .create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor {
+            label: Some("G-buffer"),
+            entries: &[
+                entry(0, wgpu::BufferBindingType::Uniform),
+                entry(1, storage),
+                entry(2, storage),
+                entry(3, storage),
+            ],
+        })
 }
 
 fn pipeline(
@@ -427,11 +447,13 @@ fn pipeline(
     binding: &wgpu::BindGroupLayout,
     kind: usize,
 ) -> wgpu::RenderPipeline {
-    let layout = gpu.device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
-        label: None,
-        bind_group_layouts: &[Some(binding)],
-        immediate_size: 0,
-    });
+    let layout = gpu
+        .device
+        .create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
+            label: None,
+            bind_group_layouts: &[Some(binding)],
+            immediate_size: 0,
+        });
     let stream = |attributes| {
         Some(wgpu::VertexBufferLayout {
             array_stride: VERTEX_BYTES,
@@ -440,46 +462,47 @@ fn pipeline(
         })
     };
     let target = |format: Format| Some(wgpu::ColorTargetState::from(format));
-    gpu.device.create_render_pipeline(&wgpu::RenderPipelineDescriptor {
-        label: Some("G-buffer"),
-        layout: Some(&layout),
-        vertex: wgpu::VertexState {
-            module: shader,
-            entry_point: Some("corner"),
-            compilation_options: Default::default(),
-            buffers: &[
-                stream(&wgpu::vertex_attr_array![0 => Float32x3, 1 => Float32x3]),
-                stream(&wgpu::vertex_attr_array![2 => Float32x3, 3 => Float32x3]),
-                Some(wgpu::VertexBufferLayout {
-                    array_stride: 8,
-                    step_mode: wgpu::VertexStepMode::Vertex,
-                    attributes: &wgpu::vertex_attr_array![4 => Float32x2],
-                }),
-            ],
-        },
-        primitive: wgpu::PrimitiveState {
-            front_face: match kind % 3 {
-                1 => wgpu::FrontFace::Cw,
-                _ => wgpu::FrontFace::Ccw,
+    gpu.device
+        .create_render_pipeline(&wgpu::RenderPipelineDescriptor {
+            label: Some("G-buffer"),
+            layout: Some(&layout),
+            vertex: wgpu::VertexState {
+                module: shader,
+                entry_point: Some("corner"),
+                compilation_options: Default::default(),
+                buffers: &[
+                    stream(&wgpu::vertex_attr_array![0 => Float32x3, 1 => Float32x3]),
+                    stream(&wgpu::vertex_attr_array![2 => Float32x3, 3 => Float32x3]),
+                    Some(wgpu::VertexBufferLayout {
+                        array_stride: 8,
+                        step_mode: wgpu::VertexStepMode::Vertex,
+                        attributes: &wgpu::vertex_attr_array![4 => Float32x2],
+                    }),
+                ],
             },
-            cull_mode: (kind % 3 != 2).then_some(wgpu::Face::Back),
-            ..Default::default()
-        },
-        depth_stencil: Some(wgpu::DepthStencilState {
-            format: DEPTH,
-            depth_write_enabled: Some(true),
-            depth_compare: Some(wgpu::CompareFunction::Greater),
-            stencil: Default::default(),
-            bias: Default::default(),
-        }),
-        multisample: Default::default(),
-        fragment: Some(wgpu::FragmentState {
-            module: shader,
-            entry_point: Some(if kind < 3 { "solid" } else { "masked" }),
-            compilation_options: Default::default(),
-            targets: &[target(POSITION), target(NORMAL), target(WORLD)],
-        }),
-        multiview_mask: None,
-        cache: None,
-    })
+            primitive: wgpu::PrimitiveState {
+                front_face: match kind % 3 {
+                    1 => wgpu::FrontFace::Cw,
+                    _ => wgpu::FrontFace::Ccw,
+                },
+                cull_mode: (kind % 3 != 2).then_some(wgpu::Face::Back),
+                ..Default::default()
+            },
+            depth_stencil: Some(wgpu::DepthStencilState {
+                format: DEPTH,
+                depth_write_enabled: Some(true),
+                depth_compare: Some(wgpu::CompareFunction::Greater),
+                stencil: Default::default(),
+                bias: Default::default(),
+            }),
+            multisample: Default::default(),
+            fragment: Some(wgpu::FragmentState {
+                module: shader,
+                entry_point: Some(if kind < 3 { "solid" } else { "masked" }),
+                compilation_options: Default::default(),
+                targets: &[target(POSITION), target(NORMAL), target(WORLD)],
+            }),
+            multiview_mask: None,
+            cache: None,
+        })
 }

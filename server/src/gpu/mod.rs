@@ -4,8 +4,8 @@
 //! one that they share: position and normal in an instance's local (or rest) space, and depth.
 
 pub mod gbuffer;
-//MOD screen
-//MOD trace
+pub mod screen;
+pub mod trace;
 
 use crate::camera::Camera;
 use bytemuck::{Pod, Zeroable};
@@ -33,17 +33,17 @@ impl Gpu {
     /// There is none, or it gives no access; says what to install.
     pub fn open() -> Result<Gpu, String> {
         let instance = wgpu::Instance::new(wgpu::InstanceDescriptor::new_without_display_handle());
-        Gpu::of(&instance, None)
+        Ok(Gpu::of(&instance, None)?.0)
     }
 
-    /// The fastest device that can show pictures on a surface, if one is given.
+    /// The fastest device that can show pictures on a surface, if one is given, and its adapter.
     ///
     /// # Errors
     /// As [`Gpu::open`].
     pub fn of(
         instance: &wgpu::Instance,
         surface: Option<&wgpu::Surface<'_>>,
-    ) -> Result<Gpu, String> {
+    ) -> Result<(Gpu, wgpu::Adapter), String> {
         let options = wgpu::RequestAdapterOptions {
             power_preference: wgpu::PowerPreference::HighPerformance,
             compatible_surface: surface,
@@ -64,11 +64,12 @@ impl Gpu {
         };
         let (device, queue) = pollster::block_on(adapter.request_device(&wanted))
             .map_err(|error| format!("{}: {error}", adapter.get_info().name))?;
-        Ok(Gpu {
+        let gpu = Gpu {
             device,
             queue,
             info: adapter.get_info(),
-        })
+        };
+        Ok((gpu, adapter))
     }
 
     /// Name and driver.
@@ -94,7 +95,9 @@ impl Gpu {
         let bytes: &[u8] = bytemuck::cast_slice(content);
         let limits = self.device.limits();
         let most = if usage.contains(wgpu::BufferUsages::STORAGE) {
-            limits.max_buffer_size.min(limits.max_storage_buffer_binding_size)
+            limits
+                .max_buffer_size
+                .min(limits.max_storage_buffer_binding_size)
         } else {
             limits.max_buffer_size
         };
@@ -127,7 +130,8 @@ impl Gpu {
         }
     }
 
-    fn uniform<T: Pod>(&self, what: &str, value: &T) -> wgpu::Buffer {
+    /// A uniform buffer that holds a value.
+    pub fn uniform<T: Pod>(&self, what: &str, value: &T) -> wgpu::Buffer {
         let bytes = bytemuck::bytes_of(value);
         let buffer = self.device.create_buffer(&wgpu::BufferDescriptor {
             label: Some(what),
@@ -141,10 +145,11 @@ impl Gpu {
 
     fn shader(&self, what: &str, source: &str) -> wgpu::ShaderModule {
         let source = Cow::Owned(format!("{}\n{source}", include_str!("eye.wgsl")));
-        self.device.create_shader_module(wgpu::ShaderModuleDescriptor {
-            label: Some(what),
-            source: wgpu::ShaderSource::Wgsl(source),
-        })
+        self.device
+            .create_shader_module(wgpu::ShaderModuleDescriptor {
+                label: Some(what),
+                source: wgpu::ShaderSource::Wgsl(source),
+            })
     }
 
     fn compute(&self, module: &wgpu::ShaderModule, entry: &str) -> wgpu::ComputePipeline {
@@ -159,8 +164,8 @@ impl Gpu {
         self.device.create_compute_pipeline(&descriptor)
     }
 
-    /// Resources in the order of their binding numbers.
-    fn bind(
+    /// Resources with their binding numbers.
+    pub fn bind(
         &self,
         layout: &wgpu::BindGroupLayout,
         resources: &[(u32, wgpu::BindingResource<'_>)],
@@ -214,6 +219,16 @@ impl Gpu {
         }))
     }
 
+    /// A picture of one number a pixel for passes to write: 1 is open, 0 fully occluded.
+    ///
+    /// # Errors
+    /// The device has none of that size.
+    pub fn openness(&self, size: [u32; 2]) -> Result<wgpu::Texture, String> {
+        let format = wgpu::TextureFormat::R32Float;
+        let usage = wgpu::TextureUsages::STORAGE_BINDING | wgpu::TextureUsages::RENDER_ATTACHMENT;
+        self.texture("openness", size, 1, format, usage)
+    }
+
     /// An empty list of work.
     pub fn encoder(&self) -> wgpu::CommandEncoder {
         self.device.create_command_encoder(&Default::default())
@@ -230,7 +245,8 @@ impl Gpu {
 
     fn wait(&self) -> Result<(), String> {
         let done = self.device.poll(wgpu::PollType::wait_indefinitely());
-        done.map(|_| ()).map_err(|error| format!("{}: {error}", self.info.name))
+        done.map(|_| ())
+            .map_err(|error| format!("{}: {error}", self.info.name))
     }
 
     /// What is in a buffer (that may be copied from).
@@ -287,8 +303,53 @@ impl Gpu {
         );
         self.queue.submit([encoder.finish()]);
         let bytes = self.mapped(&landing)?;
-        let rows = bytes.chunks(pitch as usize).map(|padded| &padded[..row as usize]);
-        Ok(bytemuck::pod_collect_to_vec(&rows.collect::<Vec<_>>().concat()))
+        let rows = bytes
+            .chunks(pitch as usize)
+            .map(|padded| &padded[..row as usize]);
+        Ok(bytemuck::pod_collect_to_vec(
+            &rows.collect::<Vec<_>>().concat(),
+        ))
+    }
+}
+
+/// A compute pass with all that it reads and writes.
+pub struct Pass {
+    /// What it does, as its shader says.
+    pub name: &'static str,
+    pipeline: wgpu::ComputePipeline,
+    groups: Vec<wgpu::BindGroup>,
+    /// Workgroups across and down.
+    workgroups: [u32; 2],
+}
+
+impl Pass {
+    fn new(
+        gpu: &Gpu,
+        name: &'static str,
+        pipeline: wgpu::ComputePipeline,
+        groups: &[&[(u32, wgpu::BindingResource<'_>)]],
+        workgroups: [u32; 2],
+    ) -> Pass {
+        let bind = |(index, resources): (u32, &&[_])| {
+            gpu.bind(&pipeline.get_bind_group_layout(index), resources)
+        };
+        let groups = (0..).zip(groups).map(bind).collect();
+        Pass {
+            name,
+            pipeline,
+            groups,
+            workgroups,
+        }
+    }
+
+    /// Adds the pass to a list of work.
+    pub fn record(&self, encoder: &mut wgpu::CommandEncoder) {
+        let mut pass = encoder.begin_compute_pass(&Default::default());
+        pass.set_pipeline(&self.pipeline);
+        for (index, group) in (0..).zip(&self.groups) {
+            pass.set_bind_group(index, group, &[]);
+        }
+        pass.dispatch_workgroups(self.workgroups[0], self.workgroups[1], 1);
     }
 }
 
@@ -297,6 +358,8 @@ pub struct Stopwatch {
     queries: wgpu::QuerySet,
     resolved: wgpu::Buffer,
     marks: u32,
+    /// Written to behind each mark, where that is needed.
+    fence: Option<wgpu::Buffer>,
 }
 
 /// Most marks of a stopwatch.
@@ -325,6 +388,9 @@ impl Stopwatch {
                 mapped_at_creation: false,
             }),
             marks: 0,
+            // Lavapipe takes the time of a mark when it next waits for what was drawn, which
+            // computing does not make it do, but a barrier does.
+            fence: (gpu.info.device_type == wgpu::DeviceType::Cpu).then(|| gpu.landing(16)),
         })
     }
 
@@ -335,6 +401,11 @@ impl Stopwatch {
     pub fn mark(&mut self, encoder: &mut wgpu::CommandEncoder) {
         encoder.write_timestamp(&self.queries, self.marks);
         self.marks += 1;
+        if let Some(fence) = &self.fence {
+            // Between two writes there is one.
+            encoder.clear_buffer(fence, 0, None);
+            encoder.clear_buffer(fence, 0, None);
+        }
     }
 
     /// Does the work, and says how many milliseconds lie between each two marks.
@@ -352,7 +423,9 @@ impl Stopwatch {
         let ticks: Vec<u64> = gpu.read(&self.resolved)?;
         let tick_ms = f64::from(gpu.queue.get_timestamp_period()) * 1e-6;
         let pairs = ticks[..marks as usize].windows(2);
-        Ok(pairs.map(|pair| pair[1].saturating_sub(pair[0]) as f64 * tick_ms).collect())
+        Ok(pairs
+            .map(|pair| pair[1].saturating_sub(pair[0]) as f64 * tick_ms)
+            .collect())
     }
 }
 
