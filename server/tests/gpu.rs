@@ -5,8 +5,13 @@
 use psao_server::camera::Camera;
 use psao_server::gpu::Gpu;
 use psao_server::gpu::gbuffer::{GBuffer, Renderer};
-use psao_server::render::View;
-use psao_server::scene::Scene;
+use psao_server::gpu::screen::{self, HIGH, LOW, Quality, Source};
+use psao_server::gpu::trace::{GpuTracer, Ray};
+use psao_server::metrics::Pair;
+use psao_server::rays::Against;
+use psao_server::render::{REFERENCE_RAYS, View};
+use psao_server::samples::Samples;
+use psao_server::scene::{Instance, LocalTransform, Mesh, Node, Scene};
 use psao_server::world::{Options, World};
 
 fn gpu() -> Gpu {
@@ -21,13 +26,27 @@ fn atrium(time_s: f64) -> World {
         rest_space: true,
         ..Options::of(psao_core::Kernel::Planar)
     };
-    let mut world = World::new(Scene::atrium(), options, &|_, _, _| ()).expect("the built-in scene");
+    let mut world =
+        World::new(Scene::atrium(), options, &|_, _, _| ()).expect("the built-in scene");
     world.step(time_s, &|_| false, 0);
     world
 }
 
 fn camera(world: &World, aspect: f32) -> Camera {
-    psao_server::args::camera_path(world, 0, aspect).expect("a path").at(world.pose.time_s)
+    psao_server::args::camera_path(world, 0, aspect)
+        .expect("a path")
+        .at(world.pose.time_s)
+}
+
+/// The world drawn from the camera.
+fn drawn(gpu: &Gpu, world: &World, camera: &Camera, size: [u32; 2]) -> (Renderer, GBuffer) {
+    let mut renderer = Renderer::new(gpu, &world.scene, true).expect("a small scene");
+    renderer.pose(gpu, &world.scene, &world.pose);
+    let mut buffer = GBuffer::new(gpu, size[0], size[1]).expect("a small picture");
+    let mut encoder = gpu.encoder();
+    renderer.draw(gpu, &world.scene, camera, &mut encoder, &mut buffer);
+    gpu.finish(encoder).expect("a device");
+    (renderer, buffer)
 }
 
 #[test]
@@ -35,13 +54,8 @@ fn the_gbuffer_shows_what_the_processors_rays_see() {
     let gpu = gpu();
     let world = atrium(2.5);
     let (width, height) = (240, 135);
-    let mut renderer = Renderer::new(&gpu, &world.scene, true).expect("a small scene");
-    renderer.pose(&gpu, &world.scene, &world.pose);
-    let mut buffer = GBuffer::new(&gpu, width, height).expect("a small picture");
     let camera = camera(&world, width as f32 / height as f32);
-    let mut encoder = gpu.encoder();
-    renderer.draw(&gpu, &world.scene, &camera, &mut encoder, &mut buffer);
-    gpu.finish(encoder).expect("a device");
+    let (_, buffer) = drawn(&gpu, &world, &camera, [width, height]);
 
     let drawn = buffer.view(&gpu).expect("a device");
     let cast = View::new(&world, &camera, width as usize, height as usize);
@@ -68,11 +82,233 @@ fn the_gbuffer_shows_what_the_processors_rays_see() {
          {faces_the_same_way} the same normal",
         instances.len()
     );
-    assert!(instances.len() > 5, "{} instances are not much of a test", instances.len());
-    assert!(same as f64 > 0.995 * all as f64, "{same} of {all} pixels show the same instance");
-    assert!(near as f64 > 0.995 * same as f64, "{near} of {same} pixels show the same place");
+    assert!(
+        instances.len() > 5,
+        "{} instances are not much of a test",
+        instances.len()
+    );
+    assert!(
+        same as f64 > 0.995 * all as f64,
+        "{same} of {all} pixels show the same instance"
+    );
+    assert!(
+        near as f64 > 0.995 * same as f64,
+        "{near} of {same} pixels show the same place"
+    );
     assert!(
         faces_the_same_way as f64 > 0.995 * same as f64,
         "{faces_the_same_way} of {same} pixels have the same normal"
     );
+}
+
+#[test]
+fn each_ray_hits_on_the_gpu_what_it_hits_on_the_processor() {
+    let gpu = gpu();
+    let mut world = atrium(0.0);
+    let samples = Samples::new(64);
+    let mut tracer =
+        GpuTracer::new(&gpu, &world.scene, &world.pose, &samples).expect("a small scene");
+    for time_s in [0.0, 3.25] {
+        world.step(time_s, &|_| false, 0);
+        tracer
+            .pose(&gpu, &world.scene, &world.pose)
+            .expect("a small scene");
+        // From what the camera sees, all ways and far: many near misses.
+        let view = View::new(&world, &camera(&world, 2.0), 40, 20);
+        let seen: Vec<_> = view.fragments.iter().flatten().collect();
+        let mut rays = Vec::new();
+        let mut expected = Vec::new();
+        for (number, fragment) in (0..).zip(&seen) {
+            let at = world.pose.instances[fragment.instance as usize].world_from_local;
+            let posed = !world.scene.instances[fragment.instance as usize].deforms;
+            let origin = at.transform_point3(fragment.position)
+                + at.transform_vector3(fragment.normal).normalize() * 0.01;
+            let mut directions = vec![glam::Vec3::ZERO; 64];
+            let normal = if number % 2 == 0 {
+                fragment.normal
+            } else {
+                -fragment.normal
+            };
+            samples.directions(number, normal, glam::Vec3::X, &mut directions);
+            for t_max in [0.6, 30.0] {
+                let mut hit = [0];
+                if posed {
+                    let todo = [u64::MAX];
+                    let all = Against::All;
+                    world
+                        .tracer()
+                        .occluded(all, origin, &directions, t_max, &todo, &mut hit);
+                    expected.extend((0..64).map(|i| hit[0] >> i & 1 == 1));
+                    rays.extend(directions.iter().map(|&direction| Ray {
+                        origin,
+                        t_max,
+                        direction,
+                        unused: 0.0,
+                    }));
+                }
+            }
+        }
+        let found = tracer.occluded(&gpu, &rays).expect("a device");
+        assert_eq!(found.len(), expected.len());
+        let blocked = expected.iter().filter(|hit| **hit).count();
+        let differ = found.iter().zip(&expected).filter(|(a, b)| a != b).count();
+        println!(
+            "at {time_s} s: of {} rays {blocked} hit, {differ} differ",
+            rays.len()
+        );
+        assert!(
+            blocked * 5 > rays.len() && blocked < rays.len() / 20 * 19,
+            "not much of a test"
+        );
+        // Those that graze an edge: one computes movers' in local space.
+        assert!(
+            differ * 20_000 <= rays.len(),
+            "{differ} of {} rays differ",
+            rays.len()
+        );
+    }
+}
+
+#[test]
+fn pixels_traced_on_the_gpu_are_those_traced_on_the_processor() {
+    let gpu = gpu();
+    let world = atrium(1.0);
+    let size = [64, 36];
+    let camera = camera(&world, 16.0 / 9.0);
+    let (renderer, buffer) = drawn(&gpu, &world, &camera, size);
+    let samples = Samples::new(REFERENCE_RAYS);
+    let tracer = GpuTracer::new(&gpu, &world.scene, &world.pose, &samples).expect("small");
+    let openness = gpu.openness(size).expect("a small picture");
+    let mut encoder = gpu.encoder();
+    for first in (0..REFERENCE_RAYS as u32).step_by(128) {
+        let t_max = world.options.ao_distance_m;
+        let rays = [first, 128];
+        tracer
+            .pixels(&gpu, &buffer, &renderer, &openness, t_max, rays)
+            .record(&mut encoder);
+    }
+    gpu.finish(encoder).expect("a device");
+    let found: Vec<f32> = gpu.read_texture(&openness).expect("a device");
+    let view = buffer.view(&gpu).expect("a device");
+    let expected = view.trace(&world, &samples);
+    let pair = Pair::new(&expected, &found, &view.valid(), 64, 36).expect("one size");
+    println!("PSNR {:.1} dB between two references", pair.psnr_db());
+    // Both are turned at random; each has an error of its own of about 50 dB.
+    assert!(pair.psnr_db() > 44.0, "{} dB", pair.psnr_db());
+}
+
+/// A floor and a wall that meet at a right angle, 40 m each way.
+fn corner_scene() -> Scene {
+    use glam::Vec3;
+    let quad = |a: Vec3, b: Vec3, c: Vec3, d: Vec3, normal: Vec3| Mesh {
+        positions: vec![a, b, c, d],
+        normals: vec![normal; 4],
+        triangles: vec![[0, 1, 2], [0, 2, 3]],
+        ..Mesh::default()
+    };
+    let at = |x: f32, y: f32, z: f32| Vec3::new(x, y, z) * 20.0;
+    let floor = [
+        at(-1.0, 0.0, 0.0),
+        at(-1.0, 0.0, 2.0),
+        at(1.0, 0.0, 2.0),
+        at(1.0, 0.0, 0.0),
+    ];
+    let wall = [
+        at(-1.0, 0.0, 0.0),
+        at(1.0, 0.0, 0.0),
+        at(1.0, 2.0, 0.0),
+        at(-1.0, 2.0, 0.0),
+    ];
+    let instance = |mesh: u32| Instance {
+        name: String::new(),
+        mesh,
+        node: 0,
+        skin: None,
+        moves: false,
+        deforms: false,
+    };
+    let [a, b, c, d] = floor;
+    let [e, f, g, h] = wall;
+    Scene {
+        meshes: vec![quad(a, b, c, d, Vec3::Y), quad(e, f, g, h, Vec3::Z)],
+        nodes: vec![Node {
+            name: String::new(),
+            parent: None,
+            local: LocalTransform::IDENTITY,
+            morph_weights: Vec::new(),
+        }],
+        instances: vec![instance(0), instance(1)],
+        ..Scene::default()
+    }
+}
+
+/// Openness at `distance` from an endless wall at a right angle, by rays of length `radius`: those
+/// that meet the wall are a segment of the disc that the cosine-weighted hemisphere projects to.
+fn beside_a_wall(distance: f32, radius: f32) -> f32 {
+    let c = (distance / radius).min(1.0);
+    1.0 - (c.acos() - c * (1.0 - c * c).sqrt()) / std::f32::consts::PI
+}
+
+#[test]
+fn screen_space_occlusion_of_a_corner_is_the_closed_forms() {
+    let gpu = gpu();
+    let scene = corner_scene();
+    let (size, radius_m) = ([320u32, 240u32], 0.6);
+    let camera = Camera {
+        position: glam::Vec3::new(0.0, 1.5, 3.0),
+        forward: glam::Vec3::new(0.0, -0.35, -1.0),
+        up: glam::Vec3::Y,
+        fov_y_rad: 1.0,
+        aspect: 4.0 / 3.0,
+        near: 0.05,
+        far: f32::INFINITY,
+    };
+    let renderer = Renderer::new(&gpu, &scene, true).expect("a small scene");
+    let mut buffer = GBuffer::new(&gpu, size[0], size[1]).expect("a small picture");
+    let mut encoder = gpu.encoder();
+    renderer.draw(&gpu, &scene, &camera, &mut encoder, &mut buffer);
+    gpu.finish(encoder).expect("a device");
+    let view = buffer.view(&gpu).expect("a device");
+    let openness = gpu.openness(size).expect("a small picture");
+    let errors = |quality: Quality| {
+        // Nothing is behind these surfaces.
+        let source = Source::Screen {
+            quality,
+            radius_m,
+            thickness_m: 1e3,
+        };
+        let mut encoder = gpu.encoder();
+        for pass in screen::passes(&gpu, &buffer, source, &openness).expect("small") {
+            pass.record(&mut encoder);
+        }
+        gpu.finish(encoder).expect("a device");
+        let found: Vec<f32> = gpu.read_texture(&openness).expect("a device");
+        let (mut sum, mut bias, mut count) = (0.0, 0.0, 0.0);
+        for (pixel, fragment) in view.fragments.iter().enumerate() {
+            let Some(fragment) = fragment else { continue };
+            let at = [pixel % size[0] as usize, pixel / size[0] as usize];
+            // Occluders must be in the picture, and no nearer than some pixels.
+            let inside = |at: usize, edge: u32| at > 60 && at < edge as usize - 60;
+            let to_wall = fragment.position.y.max(fragment.position.z);
+            if inside(at[0], size[0]) && inside(at[1], size[1]) && to_wall > 0.05 {
+                let error = found[pixel] - beside_a_wall(to_wall, radius_m);
+                sum += error.abs();
+                bias += error;
+                count += 1.0;
+            }
+        }
+        assert!(count > 5000.0, "{count} pixels are not much of a test");
+        (sum / count, bias / count)
+    };
+    let fine = errors(Quality {
+        slices: 16,
+        steps: 32,
+        denoise: 0,
+    });
+    let (high, low) = (errors(HIGH), errors(LOW));
+    println!("mean |error| and mean error: 16 x 32 {fine:?}, high {high:?}, low {low:?}");
+    assert!(fine.0 < 0.01, "the method itself: {fine:?}");
+    // Few samples miss the top of the wall: a bias that any number of passes keeps.
+    assert!(high.0 < 0.04, "high: {high:?}");
+    assert!(low.0 < 0.06, "low: {low:?}");
 }
