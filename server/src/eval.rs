@@ -615,7 +615,7 @@ fn mean(values: &[f64]) -> f64 {
 }
 
 /// The value that this share of the values is below.
-fn percentile(values: &[f64], share: f64) -> f64 {
+pub(crate) fn percentile(values: &[f64], share: f64) -> f64 {
     let mut sorted = values.to_vec();
     sorted.sort_by(f64::total_cmp);
     let index = (sorted.len() as f64 * share) as usize;

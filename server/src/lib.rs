@@ -1,6 +1,8 @@
 //! The PSAO reference server: `scene ─► points ─► occlusion ─► select ─► encode ─► transport`.
 
 pub mod args;
+#[cfg(feature = "gpu")]
+pub mod bench_gpu;
 pub mod camera;
 pub mod commands;
 pub mod demo;
