@@ -119,9 +119,7 @@ impl Source {
         let options = glsl::Options {
             version: glsl::Version::new_gles(version),
             writer_flags: glsl::WriterFlags::empty(),
-            binding_map: (0..3)
-                .map(|slot| (resource(slot), slot as u8))
-                .collect(),
+            binding_map: (0..3).map(|slot| (resource(slot), slot as u8)).collect(),
             zero_initialize_workgroup_memory: false,
         };
         let pipeline = glsl::PipelineOptions {
@@ -238,7 +236,9 @@ fn without_struct(text: &str, head: &str) -> String {
     let Some(start) = text.find(head) else {
         return text.into();
     };
-    let end = text[start..].find("};\n").map_or(text.len(), |at| start + at + 3);
+    let end = text[start..]
+        .find("};\n")
+        .map_or(text.len(), |at| start + at + 3);
     format!("{}{}", &text[..start], &text[end..])
 }
 
