@@ -1,6 +1,6 @@
 //! `sdk/shaders/psao.wgsl` in the languages of engines: snippets to paste, without an entry point.
 
-use naga::back::{glsl, hlsl, msl, spv};
+use naga::back::{glsl, hlsl, msl};
 use naga::proc::BoundsCheckPolicies;
 use naga::valid::{Capabilities, ModuleInfo, ValidationFlags, Validator};
 use naga::{Module, ShaderStage};
@@ -99,7 +99,7 @@ pub fn generate(root: &Path) -> Result<Vec<(&'static str, String)>, String> {
 }
 
 /// A parsed and validated source.
-pub struct Source {
+struct Source {
     module: Module,
     info: ModuleInfo,
 }
@@ -148,7 +148,12 @@ impl Source {
         let mut text = kept.join("\n");
         for (slot, name) in BUFFERS.iter().enumerate() {
             text = text.replace(&format!("_group_0_binding_{slot}_fs"), name);
-            text = text.replace(&format!("psao_{}_block_{slot}Fragment", ""), name);
+            // The type's number before it changes with the source, and may be an engine's too.
+            let block = format!("_block_{slot}Fragment");
+            if let Some(end) = text.find(&block).map(|at| at + block.len()) {
+                let start = text[..end].rfind(' ').map_or(0, |at| at + 1);
+                text.replace_range(start..end, &format!("{name}_block"));
+            }
         }
         Ok(format!("{HEADER}{binding}\n{}\n", tidy(&text)))
     }
@@ -198,19 +203,6 @@ impl Source {
         let text = cut(&text, "fragment psao_probeOutput psao_probe(")?;
         Ok(format!("{HEADER}{binding}\n{}\n", tidy(text)))
     }
-
-    /// For validators; nothing keeps it.
-    ///
-    /// # Errors
-    /// It cannot be said in SPIR-V.
-    pub fn spirv(&self) -> Result<Vec<u32>, String> {
-        let options = spv::Options {
-            lang_version: (1, 3),
-            ..spv::Options::default()
-        };
-        spv::write_vec(&self.module, &self.info, &options, None)
-            .map_err(|error| format!("SPIR-V: {error}"))
-    }
 }
 
 const BUFFERS: [&str; 3] = ["psao_instances", "psao_buckets", "psao_cells"];
@@ -251,4 +243,119 @@ fn tidy(text: &str) -> String {
         }
     }
     lines.join("\n")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use naga::back::spv;
+    use std::process::Command;
+
+    fn root() -> &'static Path {
+        Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../.."))
+    }
+
+    fn snippet(name: &str) -> String {
+        let files = generate(root()).unwrap();
+        let (_, text) = files.iter().find(|(path, _)| path.ends_with(name)).unwrap();
+        text.clone()
+    }
+
+    /// Runs a validator over a file of this content; it must be content with it.
+    fn valid(program: &str, words: &[&str], name: &str, content: &[u8]) {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join(name);
+        std::fs::write(&path, content).unwrap();
+        let output = Command::new(program)
+            .current_dir(folder.path())
+            .args(words)
+            .arg(&path)
+            .output()
+            .unwrap_or_else(|error| panic!("{program}: {error}: tests/run installs it"));
+        let said = String::from_utf8_lossy(&output.stdout).into_owned();
+        let error = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(output.status.success(), "{program} {words:?}: {said}{error}");
+    }
+
+    const GLSL_MAIN: &str = "
+layout(location = 0) in vec3 position;
+layout(location = 1) in vec3 normal;
+layout(location = 2) flat in uint instance;
+layout(location = 0) out vec4 color;
+void main() {
+    color = vec4(psao_planar_fast(instance, position, normal), psao_planar(instance, position,
+        normal), psao_paper(instance, position, normal), 1.0);
+}
+";
+
+    #[test]
+    fn the_glsl_snippets_are_valid_in_a_shader_of_an_engine() {
+        for (name, version, words) in [
+            ("psao_es310.glsl", "310 es", &[][..]),
+            ("psao_es310.glsl", "450", &["-V"][..]),
+            ("psao_es300.glsl", "300 es", &[][..]),
+        ] {
+            // Locations of what comes from another stage are not GLSL ES 3.00.
+            let main = match version {
+                "300 es" => GLSL_MAIN.replace("layout(location = 0) in", "in"),
+                _ => GLSL_MAIN.into(),
+            };
+            let main = match version {
+                "300 es" => main
+                    .replace("layout(location = 1) in", "in")
+                    .replace("layout(location = 2) flat in", "flat in"),
+                _ => main,
+            };
+            let text = format!("#version {version}\n{}{main}", snippet(name));
+            valid("glslangValidator", words, "shader.frag", text.as_bytes());
+        }
+    }
+
+    #[test]
+    fn the_hlsl_snippet_is_valid_in_a_shader_of_an_engine() {
+        let main = "
+float4 main(float3 position : P, float3 normal : N, nointerpolation uint instance : I) : SV_Target
+{
+    return float4(psao_planar_fast(instance, position, normal), psao_planar(instance, position,
+        normal), psao_paper(instance, position, normal), 1.0);
+}
+";
+        let text = snippet("psao.hlsl") + main;
+        let words = ["-D", "-V", "-S", "frag", "-e", "main"];
+        valid("glslangValidator", &words, "shader.hlsl", text.as_bytes());
+    }
+
+    #[test]
+    fn the_source_is_valid_as_spir_v() {
+        let read = |name: &str| std::fs::read_to_string(root().join("sdk/shaders").join(name));
+        for shim in ["storage.wgsl", "texel.wgsl"] {
+            let (shim_text, functions) = (read(shim).unwrap(), read("psao.wgsl").unwrap());
+            let source = Source::parse(shim, &shim_text, &functions).unwrap();
+            let options = spv::Options {
+                lang_version: (1, 3),
+                ..spv::Options::default()
+            };
+            let words = spv::write_vec(&source.module, &source.info, &options, None).unwrap();
+            let bytes: Vec<u8> = words.iter().flat_map(|word| word.to_le_bytes()).collect();
+            valid("spirv-val", &["--target-env", "vulkan1.1"], "shader.spv", &bytes);
+        }
+    }
+
+    #[test]
+    fn names_of_snippets_do_not_meet_those_of_an_engine() {
+        for name in ["psao_es310.glsl", "psao_es300.glsl", "psao.hlsl", "psao.metal"] {
+            let text = snippet(name);
+            assert!(!text.contains("psao_probe"), "{name} has the probe in it");
+            assert!(!text.contains("type_"), "{name} has a name of a type's number");
+            for function in ["psao_planar_fast(", "psao_planar(", "psao_paper("] {
+                assert!(text.contains(function), "{name} lacks {function}");
+            }
+        }
+    }
+
+    #[test]
+    fn wrong_source_is_refused_with_its_place() {
+        let error = Source::parse("storage.wgsl", "fn psao_x( {", "").err().unwrap();
+        assert!(error.contains("psao.wgsl with storage.wgsl") && error.contains("wgsl:1"));
+    }
 }
