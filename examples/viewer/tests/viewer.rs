@@ -1,7 +1,7 @@
 //! The viewer shows what a recording says: to a file, and in a window.
 
 use clap::Parser;
-use psao_server::commands::{RecordArgs, record};
+use psao_server::commands::{RecordArgs, ServeArgs, record, serve};
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
@@ -90,6 +90,65 @@ fn a_picture_from_the_stream_is_nearer_to_the_ray_traced_one_than_one_without_oc
         let off = mean_difference(&picture("ao", overlay), &stream);
         assert!(off > 4.0, "overlay {overlay} does not show");
     }
+}
+
+#[derive(Parser)]
+struct Servant {
+    #[command(flatten)]
+    args: ServeArgs,
+}
+
+/// Hands on what is written to it.
+struct Lines(std::sync::mpsc::Sender<String>);
+
+impl std::io::Write for Lines {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        // Nobody listens any more when the test is done.
+        let _ = self.0.send(String::from_utf8_lossy(bytes).into_owned());
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        Ok(())
+    }
+}
+
+#[test]
+fn a_live_server_is_followed() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let identity = folder.path().join("identity");
+    let args = "psao --density 24 --rays 32 --token T --listen 127.0.0.1:0 --identity".split(' ');
+    let args = Servant::parse_from(args.chain([identity.to_str().expect("ASCII")])).args;
+    let (lines, said) = std::sync::mpsc::channel();
+    // It serves until the test's process ends.
+    std::thread::spawn(move || {
+        let served = serve(&args, &mut Lines(lines), &|_, _, _| ());
+        panic!("the server ended: {served:?}");
+    });
+    let mut text = String::new();
+    while !text.contains("scene hash") {
+        text += &said.recv().expect("the server says where it is");
+    }
+    let word = |name: &str| {
+        let mut words = text.split_whitespace().skip_while(|word| *word != name);
+        words.nth(1).unwrap_or_else(|| panic!("no {name} in {text}")).to_string()
+    };
+    let picture = |mode: &str| {
+        let file = folder.path().join(format!("{mode}.png"));
+        let out = viewer()
+            .args([word("listening"), "--fingerprint".into(), word("fingerprint")])
+            .args(["--token", "T", "--headless", "--frames", "8", "--size", "192x108"])
+            .args(["--mode", mode, "--out"])
+            .arg(&file)
+            .output()
+            .expect("the viewer starts");
+        let error = String::from_utf8_lossy(&out.stderr);
+        assert!(out.status.success(), "{error}");
+        pixels(&file).2[192 * 3 * 72..].to_vec()
+    };
+    // The figures have moved on between the two, the floor and the walls have not.
+    let off = mean_difference(&picture("ao"), &picture("off"));
+    assert!(off > 4.0, "no occlusion comes from the server: {off}");
 }
 
 #[test]

@@ -119,7 +119,9 @@ impl Source {
         let options = glsl::Options {
             version: glsl::Version::new_gles(version),
             writer_flags: glsl::WriterFlags::empty(),
-            binding_map: (0..3).map(|slot| (resource(slot), slot as u8)).collect(),
+            binding_map: (0..3)
+                .map(|slot| (resource(slot), slot as u8))
+                .collect(),
             zero_initialize_workgroup_memory: false,
         };
         let pipeline = glsl::PipelineOptions {
@@ -228,9 +230,7 @@ fn without_struct(text: &str, head: &str) -> String {
     let Some(start) = text.find(head) else {
         return text.into();
     };
-    let end = text[start..]
-        .find("};\n")
-        .map_or(text.len(), |at| start + at + 3);
+    let end = text[start..].find("};\n").map_or(text.len(), |at| start + at + 3);
     format!("{}{}", &text[..start], &text[end..])
 }
 
