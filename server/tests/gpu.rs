@@ -2,6 +2,8 @@
 //! lavapipe (Debian: mesa-vulkan-drivers).
 #![cfg(feature = "gpu")]
 
+use clap::Parser;
+use psao_server::bench_gpu::{self, BenchGpuArgs};
 use psao_server::camera::Camera;
 use psao_server::gpu::Gpu;
 use psao_server::gpu::gbuffer::{GBuffer, Renderer};
@@ -276,6 +278,7 @@ fn screen_space_occlusion_of_a_corner_is_the_closed_forms() {
             quality,
             radius_m,
             thickness_m: 1e3,
+            power: 1.0,
         };
         let mut encoder = gpu.encoder();
         for pass in screen::passes(&gpu, &buffer, source, &openness).expect("small") {
@@ -311,4 +314,40 @@ fn screen_space_occlusion_of_a_corner_is_the_closed_forms() {
     // Few samples miss the top of the wall: a bias that any number of passes keeps.
     assert!(high.0 < 0.03, "high: {high:?}");
     assert!(low.0 < 0.05, "low: {low:?}");
+}
+
+#[derive(Parser)]
+struct Bench {
+    #[command(flatten)]
+    args: BenchGpuArgs,
+}
+
+#[test]
+fn the_race_checks_and_times_every_method_and_keeps_its_pictures() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let (out, json) = (folder.path().join("out"), folder.path().join("race.json"));
+    let args = "psao --density 16 --rays 32 --size 96x54 --frames 2".split(' ');
+    let mut args = Bench::parse_from(args).args;
+    (args.out, args.json) = (Some(out.clone()), Some(json.clone()));
+    let race = bench_gpu::run(&args, &|_, _, _| ()).expect("a device with timestamps");
+    println!("{}", race.table());
+    assert!(race.exact_off_255 <= 1.0 && race.fast_off_255 <= 4.0);
+    assert_eq!(race.rows.len(), 6);
+    for row in &race.rows {
+        assert!(row.median_ms > 0.0 && row.p95_ms >= row.median_ms, "{row:?}");
+        assert!(row.psnr_db > 5.0 && row.psnr_db.is_finite(), "{row:?}");
+        assert!(row.passes.iter().all(|pass| pass.median_ms > 0.0), "{row:?}");
+    }
+    let of = |name: &str| race.rows.iter().find(|row| row.method == name).expect("a method");
+    // Noise, and the same without some of it.
+    let noisy = of("1 ray a pixel");
+    assert!(of("1 ray a pixel, denoised").psnr_db > noisy.psnr_db + 6.0);
+    // More work, a better picture.
+    assert!(of("screen space, high").psnr_db > of("screen space, low").psnr_db);
+    let page = std::fs::read_to_string(out.join("report.html")).expect("a report");
+    assert_eq!(page.matches("<svg").count(), 2);
+    let pictures = std::fs::read_dir(&out).expect("a folder").count();
+    assert_eq!(pictures, 1 + 2 * 7, "a report, and seven pictures a frame");
+    let json = std::fs::read_to_string(&json).expect("figures");
+    assert!(json.contains("\"median_ms\"") && json.contains("\"adapter\""));
 }

@@ -84,10 +84,12 @@ impl Feed {
                 return Ok(false);
             }
             if !self.next()? {
-                let Source::Recording(_, used) = &mut self.source else {
-                    return Ok(false);
-                };
-                *used = 0;
+                if self.first_ns.is_none() {
+                    return Err("the recording has no frame: record it again".into());
+                }
+                if let Source::Recording(_, used) = &mut self.source {
+                    *used = 0;
+                }
                 self.first_ns = None;
                 self.last = None;
                 self.client.restart();

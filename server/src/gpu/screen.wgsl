@@ -13,6 +13,11 @@ struct Settings {
     radius: f32,
     // How far surfaces are taken to go on behind what is seen of them, metres.
     thickness: f32,
+    // What openness is raised to in the end.
+    power: f32,
+    unused_a: u32,
+    unused_b: u32,
+    unused_c: u32,
 }
 
 @group(0) @binding(0) var<uniform> eye: Eye;
@@ -194,7 +199,8 @@ fn occlusion(@builtin(global_invocation_id) id: vec3<u32>) {
         var blocked = 0u;
         for (var way = -1.0; way < 2.0; way += 2.0) {
             for (var step = 0u; step < settings.steps; step++) {
-                let share = (f32(step) + jitter) / f32(settings.steps);
+                let apart = f32(slice + step * settings.slices) * 0.6180339887;
+                let share = (f32(step) + fract(noise.y + apart)) / f32(settings.steps);
                 let offset_px = max(share * radius_px, 1.3 + f32(step));
                 let sample_at = at + way * offset_px * vec2(along.x, -along.y);
                 if any(sample_at < vec2(0.0)) || any(sample_at >= extent) {
@@ -231,7 +237,7 @@ fn occlusion(@builtin(global_invocation_id) id: vec3<u32>) {
         all += weight;
     }
     let openness = select(1.0, open / all, all > 0.0);
-    textureStore(raw, id.xy, vec4(packed_with(openness, edges)));
+    textureStore(raw, id.xy, vec4(packed_with(pow(openness, settings.power), edges)));
 }
 
 @group(1) @binding(7) var noisy: texture_2d<u32>;

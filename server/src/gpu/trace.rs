@@ -216,9 +216,8 @@ impl GpuTracer {
         let mut scene = self.scene().to_vec();
         scene[0].1 = uniform.as_entire_binding();
         let textures = [&buffer.position, &buffer.world, &buffer.depth, openness].map(view);
-        let [position, world, depth, openness] = textures
-            .each_ref()
-            .map(|view| wgpu::BindingResource::TextureView(view));
+        let [position, world, depth, openness] =
+            textures.each_ref().map(wgpu::BindingResource::TextureView);
         let pixels = [
             (0, buffer.eye.as_entire_binding()),
             (1, position),
