@@ -8,7 +8,7 @@
 pub mod kernels;
 mod variants;
 
-use crate::args::{ProfileArg, SceneArgs, camera_path};
+use crate::args::{PlacementArg, ProfileArg, SceneArgs, camera_path};
 use crate::camera::{CameraPath, Frustum};
 use crate::demo::parse_size;
 use crate::encode::{Compression, Encoder, Eye, Limits, Scheme, View as Sight, capacity_of};
@@ -93,6 +93,9 @@ pub struct EvalArgs {
     #[arg(long, value_name = "N,...", value_delimiter = ',', default_value = "7",
           value_parser = clap::value_parser!(u8).range(1..=15))]
     pub capacities: Vec<u8>,
+    /// How points are spread (with --kernels)
+    #[arg(long, value_enum, value_delimiter = ',', default_value = "adaptive")]
+    pub placements: Vec<PlacementArg>,
     /// Which of the two camera paths to walk: tune (or 0) and check (or 1)
     #[arg(long, value_name = "PATH", default_value = "check", value_parser = parse_path)]
     pub path: u32,

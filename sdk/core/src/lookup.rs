@@ -326,11 +326,18 @@ mod tests {
             buckets: &buckets,
             cells: &cells,
         };
-        let weight = |x| lookup.blend(Kernel::Planar, 0, [x, 1.01, 1.6], [0.0, 1.0, 0.0]).weight;
+        let weight = |x| {
+            lookup
+                .blend(Kernel::Planar, 0, [x, 1.01, 1.6], [0.0, 1.0, 0.0])
+                .weight
+        };
         let steps: [f32; 2001] = core::array::from_fn(|i| weight(0.4 + i as f32 * 1.1e-3));
         let most = steps.iter().copied().fold(0.0, f32::max);
         for pair in steps.windows(2) {
-            assert!((pair[1] - pair[0]).abs() < 0.01 * most, "{pair:?} of {most}");
+            assert!(
+                (pair[1] - pair[0]).abs() < 0.01 * most,
+                "{pair:?} of {most}"
+            );
         }
         assert_eq!((steps[0], steps[2000]), (0.0, 0.0));
     }

@@ -6,16 +6,17 @@
 //! are ray traced once and shared by all variants.
 
 use super::variants::{
-    Blended, Grids, LeastSquares, Mean, Paper, Planar, Sample, Samples as SetSamples, Weigh,
+    Band, Blended, Facing, Grids, LeastSquares, Mean, Paper, Planar, Sample, Samples as SetSamples,
+    Weigh,
 };
 use super::{EvalArgs, mean, ms, percentile};
-use crate::args::{SceneArgs, camera_path};
+use crate::args::{PlacementArg, SceneArgs, camera_path};
 use crate::metrics::Pair;
 use crate::picture::{Picture, write_whole};
-use crate::render::{REFERENCE_RAYS, View};
+use crate::render::{Fragment, REFERENCE_RAYS, View};
 use crate::report::{Form, Panel, Plot, Report};
 use crate::samples::Samples;
-use crate::world::{Progress, World, scale_of};
+use crate::world::{Options, Progress, World, scale_of};
 use glam::Vec3;
 use psao_core::cell::CELL_POINTS;
 use rayon::prelude::*;
@@ -26,44 +27,32 @@ use std::time::Instant;
 
 /// A kernel that can be measured.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Name {
-    /// The paper's.
+enum Name {
     Paper,
-    /// The paper's, with the nearest point where no point counts.
     PaperNearest,
-    /// The core's planar kernel.
+    Band,
     Planar,
-    /// Experiments.
-    Fade50,
-    /// .
-    Fade100,
-    /// .
-    Soft,
-    /// .
-    Soft50,
-    /// .
-    Soft100,
-    /// Moving least squares.
+    PlanarUnfaded,
+    PlanarDark,
     LeastSquares,
-    /// .
-    LeastSquares50,
-    /// .
-    LeastSquares100,
 }
 
 /// Names, radius over rm and cell size over radius where nothing else is asked for.
-const NAMES: [(&str, Name, f32, f32); 11] = [
+const NAMES: [(&str, Name, f32, f32); 7] = [
+    // Eq. 2 to 4 of the paper; 1 where no point counts.
     ("paper", Name::Paper, 1.41, 2.0),
+    // The same; where no point counts, the nearest.
     ("paper-nearest", Name::PaperNearest, 2.0, 1.25),
-    ("planar", Name::Planar, 2.0, 1.25),
-    ("fade50", Name::Fade50, 2.0, 1.25),
-    ("fade100", Name::Fade100, 2.0, 1.25),
-    ("soft", Name::Soft, 2.0, 1.25),
-    ("soft50", Name::Soft50, 2.0, 1.25),
-    ("soft100", Name::Soft100, 2.0, 1.25),
-    ("mls", Name::LeastSquares, 2.5, 1.0),
-    ("mls50", Name::LeastSquares50, 2.5, 1.0),
-    ("mls100", Name::LeastSquares100, 2.5, 1.0),
+    // What planar was in the study that this project began with.
+    ("band", Name::Band, 2.0, 1.25),
+    // The core's default.
+    ("planar", Name::Planar, 2.0, 1.1),
+    // The same with steps where the block switches.
+    ("planar-unfaded", Name::PlanarUnfaded, 2.0, 1.1),
+    // The same with dark points counting as others do.
+    ("planar-dark", Name::PlanarDark, 2.0, 1.1),
+    // Moving least squares with planar's weights.
+    ("least-squares", Name::LeastSquares, 2.0, 1.1),
 ];
 
 /// A kernel with its radius and cell size.
@@ -135,7 +124,7 @@ pub struct Row {
     pub ssim: f64,
     /// 99th percentile of the step where the block of cells switches, 1 for all of the range.
     pub seam_p99: f64,
-    /// Share of pixels where no point counts.
+    /// Share of pixels where no point counts; for planar kernels, where none faces their way.
     pub holes_share: f64,
     /// Points read a pixel.
     pub fetched: f64,
@@ -199,11 +188,25 @@ pub fn run(args: &EvalArgs, progress: Progress<'_>) -> Result<Found, String> {
             density,
             ..args.scene.clone()
         };
-        let mut world = scene.world(true, progress)?;
-        if shots.is_empty() {
-            shots = take(&mut world, args, progress)?;
+        for &placement in &args.placements {
+            let options = Options {
+                rest_space: true,
+                // Cells so small that none overflows: what does is each variant's own affair.
+                cell_over_radius: 0.5,
+                adaptive: placement == PlacementArg::Adaptive,
+                ..scene.options()?
+            };
+            let world = World::new(scene.load()?, options, progress);
+            let mut world = world.map_err(|error| error.to_string())?;
+            if shots.is_empty() {
+                shots = take(&mut world, args, progress)?;
+            }
+            let name = match placement {
+                PlacementArg::Uniform => "uniform",
+                PlacementArg::Adaptive => "adaptive",
+            };
+            measure_all(&mut world, &shots, args, name, &mut found, progress);
         }
-        measure_all(&mut world, &shots, args, "uniform", &mut found, progress);
     }
     if let Some(path) = &args.json {
         let json = serde_json::to_string_pretty(&found).map_err(|error| error.to_string())?;
@@ -213,26 +216,27 @@ pub fn run(args: &EvalArgs, progress: Progress<'_>) -> Result<Found, String> {
         let page = folder.join("report.html");
         found.report().write(&page).map_err(|e| e.to_string())?;
         for (number, panel) in found.panels.iter().enumerate() {
-            let pictures: Vec<(&str, &Picture)> =
-                panel.pictures.iter().map(|(t, p)| (t.as_str(), p)).collect();
+            let pictures: Vec<(&str, &Picture)> = panel
+                .pictures
+                .iter()
+                .map(|(t, p)| (t.as_str(), p))
+                .collect();
             let file = folder.join(format!("errors-{number:02}.png"));
             let picture = Picture::side_by_side(&pictures);
-            picture.write_png(&file).map_err(|error| error.to_string())?;
+            picture
+                .write_png(&file)
+                .map_err(|error| error.to_string())?;
         }
     }
     Ok(found)
 }
 
 /// Pictures along the path, evenly spaced in time, with their truth.
-fn take(
-    world: &mut World,
-    args: &EvalArgs,
-    progress: Progress<'_>,
-) -> Result<Vec<Shot>, String> {
+fn take(world: &mut World, args: &EvalArgs, progress: Progress<'_>) -> Result<Vec<Shot>, String> {
     let (width, height) = args.size;
     let path = camera_path(world, args.path, width as f32 / height as f32)?;
     let samples = Samples::new(REFERENCE_RAYS);
-    let mut shot = |number: u32| {
+    let shot = |number: u32| {
         let time_s = (f64::from(number) + 0.5) / f64::from(args.pictures) * path.period_s();
         world.step(time_s, &|_| false, 0);
         let view = View::new(world, &path.at(time_s), width, height);
@@ -251,7 +255,11 @@ fn take(
 fn points_of(world: &mut World, shot: &Shot, progress: Progress<'_>) -> Vec<SetSamples> {
     world.step(shot.time_s, &|_| false, 0);
     let note = |p: Vec3| (p / NOTE_M).floor().as_ivec3();
-    let noted: HashSet<_> = shot.view.fragments.iter().flatten()
+    let noted: HashSet<_> = shot
+        .view
+        .fragments
+        .iter()
+        .flatten()
         .map(|f| note(f.world_position))
         .collect();
     let seen = |[min, max]: [Vec3; 2]| {
@@ -259,7 +267,9 @@ fn points_of(world: &mut World, shot: &Shot, progress: Progress<'_>) -> Vec<SetS
         let span = (high - low).as_i64vec3() + 1;
         // Where there are fewer fragments than boxes, the fragments are gone through.
         if span.x * span.y * span.z > noted.len() as i64 {
-            return noted.iter().any(|n| n.cmpge(low).all() && n.cmple(high).all());
+            return noted
+                .iter()
+                .any(|n| n.cmpge(low).all() && n.cmple(high).all());
         }
         (low.x..=high.x).any(|x| {
             (low.y..=high.y)
@@ -267,7 +277,9 @@ fn points_of(world: &mut World, shot: &Shot, progress: Progress<'_>) -> Vec<SetS
         })
     };
     let rays = world.options.rays;
-    world.converge(&seen, rays, &|done, total| progress("points traced", done, total));
+    world.converge(&seen, rays, &|done, total| {
+        progress("points traced", done, total)
+    });
     let world = &*world;
     let instances = 0..world.scene.instances.len() as u32;
     let sets = instances.into_par_iter().filter_map(|instance| {
@@ -280,14 +292,17 @@ fn points_of(world: &mut World, shot: &Shot, progress: Progress<'_>) -> Vec<SetS
             .filter(|slice| seen(slice.bounds))
             .flat_map(|slice| {
                 let numbers = slice.points.clone().zip(world.occlusion(slice));
-                numbers.map(|(number, &occlusion)| {
-                    let (position, normal) = world.grid_point(instance, number);
-                    Sample {
-                        position,
-                        normal,
-                        occlusion,
-                    }
-                })
+                numbers
+                    .zip(world.levels(slice))
+                    .map(|((number, &occlusion), &level)| {
+                        let (position, normal) = world.grid_point(instance, number);
+                        Sample {
+                            position,
+                            normal,
+                            occlusion,
+                            level,
+                        }
+                    })
             })
             .collect();
         (!points.is_empty()).then(|| SetSamples {
@@ -330,19 +345,14 @@ fn sized<const N: usize>(
     capacity: usize,
     found: &mut Found,
 ) -> Row {
-    type M<F> = Mean<F>;
     let go = match variant.name {
-        Name::Paper => measure::<M<Paper<false>>, N>,
-        Name::PaperNearest => measure::<M<Paper<true>>, N>,
-        Name::Planar => measure::<M<Planar<0, false, 8>>, N>,
-        Name::Fade50 => measure::<M<Planar<50, false, 8>>, N>,
-        Name::Fade100 => measure::<M<Planar<100, false, 8>>, N>,
-        Name::Soft => measure::<M<Planar<0, true, 8>>, N>,
-        Name::Soft50 => measure::<M<Planar<50, true, 8>>, N>,
-        Name::Soft100 => measure::<M<Planar<100, true, 8>>, N>,
-        Name::LeastSquares => measure::<LeastSquares<0>, N>,
-        Name::LeastSquares50 => measure::<LeastSquares<50>, N>,
-        Name::LeastSquares100 => measure::<LeastSquares<100>, N>,
+        Name::Paper => measure::<Mean<Paper<false>>, N>,
+        Name::PaperNearest => measure::<Mean<Paper<true>>, N>,
+        Name::Band => measure::<Mean<Band>, N>,
+        Name::Planar => measure::<Mean<Planar<true, true>>, N>,
+        Name::PlanarUnfaded => measure::<Mean<Planar<false, true>>, N>,
+        Name::PlanarDark => measure::<Mean<Planar<true, false>>, N>,
+        Name::LeastSquares => measure::<LeastSquares, N>,
     };
     go(world, shots, points, variant, capacity, found)
 }
@@ -373,9 +383,7 @@ fn measure<K: Weigh, const N: usize>(
         discarded += grids.discarded;
         placed += grids.points;
         let fragments: Vec<_> = shot.view.fragments.iter().flatten().collect();
-        let blend = |f: &crate::render::Fragment| {
-            grids.blend::<K>(f.instance, f.position, f.normal)
-        };
+        let blend = |f: &Fragment| grids.blend::<K>(f.instance, f.position, f.normal);
         let mut answers: Vec<Blended> = Vec::new();
         let mut times = Vec::new();
         for _ in 0..5 {
@@ -386,7 +394,11 @@ fn measure<K: Weigh, const N: usize>(
             times.push(ms(start) * 1e6 / fragments.len().max(1) as f64);
         }
         nanoseconds.push(percentile(&times, 0.5));
-        holes += answers.iter().filter(|a| a.hole).count() as f64;
+        let facing = |f: &&Fragment| grids.blend::<Facing>(f.instance, f.position, f.normal).hole;
+        holes += match variant.name {
+            Name::Paper | Name::PaperNearest => answers.iter().filter(|a| a.hole).count(),
+            _ => fragments.iter().copied().filter(facing).count(),
+        } as f64;
         fetched += answers.iter().map(|a| f64::from(a.fetched)).sum::<f64>();
         let mut next = answers.iter();
         let test: Vec<f32> = (shot.view.fragments.iter())
@@ -405,7 +417,11 @@ fn measure<K: Weigh, const N: usize>(
         let every: Vec<_> = fragments.iter().step_by(SEAM_SHARE).collect();
         let at_switches = every.par_iter().filter_map(|f| step::<K, N>(&grids, f));
         steps.extend(at_switches.collect::<Vec<f64>>());
-        let error: Vec<f32> = test.iter().zip(&shot.reference).map(|(a, b)| a - b).collect();
+        let error: Vec<f32> = test
+            .iter()
+            .zip(&shot.reference)
+            .map(|(a, b)| a - b)
+            .collect();
         pictures.push((
             format!("{:.1} s", shot.time_s),
             Picture::heat(&error, &valid, width, height, 0.25),
@@ -441,10 +457,7 @@ fn measure<K: Weigh, const N: usize>(
 }
 
 /// The step in the answer where, nearest to a fragment on its tangent plane, the block switches.
-fn step<K: Weigh, const N: usize>(
-    grids: &Grids<N>,
-    fragment: &crate::render::Fragment,
-) -> Option<f64> {
+fn step<K: Weigh, const N: usize>(grids: &Grids<N>, fragment: &Fragment) -> Option<f64> {
     let (g, cell) = grids.in_cells(fragment.instance, fragment.position)?;
     let normal = (fragment.normal * cell).normalize_or_zero();
     let mut best: Option<(f32, Vec3, usize, f32)> = None;
@@ -477,8 +490,21 @@ impl Found {
     /// All rows as a table.
     pub fn table(&self) -> String {
         let heads = [
-            "scene", "/m²", "kernel", "r/rm", "c/r", "cap", "placement", "dB", "FLIP", "SSIM",
-            "seam p99", "holes", "fetched", "ns", "discarded",
+            "scene",
+            "/m²",
+            "kernel",
+            "r/rm",
+            "c/r",
+            "cap",
+            "placement",
+            "dB",
+            "FLIP",
+            "SSIM",
+            "seam p99",
+            "holes",
+            "fetched",
+            "ns",
+            "discarded",
         ];
         let mut lines = vec![heads.map(String::from)];
         for row in &self.rows {

@@ -3,8 +3,7 @@
 
 use crate::truth::{Placement, buckets_for, choose_buckets, fit};
 use glam::Vec3;
-use psao_core::cell::BUCKET_ENTRIES;
-use psao_core::lookup::{PLANE_BAND, T_D, T_N};
+use psao_core::lookup::{CORE, FADE, FLATNESS, SEEN, T_D, T_N, UNSEEN};
 use psao_core::point::{NORMALS, decode_position};
 use psao_core::{Bucket, Instance, Point};
 use rayon::prelude::*;
@@ -19,6 +18,8 @@ pub struct Sample {
     pub normal: Vec3,
     /// 255 is open, 0 fully occluded.
     pub occlusion: u8,
+    /// Highest level of detail that has it.
+    pub level: u8,
 }
 
 /// The points of an instance.
@@ -131,7 +132,11 @@ impl<const N: usize> Grids<N> {
             for point in found.points.iter().take_while(|p| p.is_allocated()) {
                 let d = from + Vec3::from(point.position().map(decode_position));
                 let point_normal = Vec3::from(NORMALS[point.normal() as usize]);
-                kernel.add(d, point_normal, f32::from(point.occlusion()) * (1.0 / 255.0));
+                kernel.add(
+                    d,
+                    point_normal,
+                    f32::from(point.occlusion()) * (1.0 / 255.0),
+                );
                 fetched += 1;
             }
         }
@@ -168,15 +173,21 @@ fn fill<const N: usize>(
     cell_over_radius: f32,
     capacity: usize,
 ) -> Option<Filled<N>> {
-    let bounds = set.points.iter().fold(
-        [Vec3::INFINITY, Vec3::NEG_INFINITY],
-        |[min, max], point| [min.min(point.position), max.max(point.position)],
-    );
+    let bounds = set
+        .points
+        .iter()
+        .fold([Vec3::INFINITY, Vec3::NEG_INFINITY], |[min, max], point| {
+            [min.min(point.position), max.max(point.position)]
+        });
     let mut grid = fit(bounds, set.scale, cell_m, 1.0 / cell_over_radius)?;
     let mut index: HashMap<[u32; 3], usize> = HashMap::new();
     let mut cells: Vec<([u32; 3], Cell<N>)> = Vec::new();
     let mut discarded = 0;
-    for point in &set.points {
+    // The server drops the last of the progressive order where a cell overflows.
+    let mut order: Vec<usize> = (0..set.points.len()).collect();
+    let mixed = |i: usize| (i as u64 + 1).wrapping_mul(0x9e37_79b9_7f4a_7c15);
+    order.sort_by_key(|&i| (std::cmp::Reverse(set.points[i].level), mixed(i)));
+    for point in order.iter().map(|&i| &set.points[i]) {
         let Some(at) = Placement::of(&grid, point.position, point.normal) else {
             discarded += 1;
             continue;
@@ -194,8 +205,9 @@ fn fill<const N: usize>(
     }
     let all: Vec<[u32; 3]> = cells.iter().map(|(at, _)| *at).collect();
     grid.bucket_count = choose_buckets(&grid, &all, buckets_for(all.len()));
-    cells.iter_mut().for_each(|(at, cell)| cell.key = grid.key(*at));
-    let _ = BUCKET_ENTRIES;
+    cells
+        .iter_mut()
+        .for_each(|(at, cell)| cell.key = grid.key(*at));
     Some(Filled {
         grid,
         cells,
@@ -254,7 +266,7 @@ pub trait Formula {
     /// As [`Weigh::enter`].
     fn enter(&mut self, _corner: usize) {}
     /// A point's weight.
-    fn weight(&self, d: Vec3, squared: f32, point_normal: Vec3) -> f32;
+    fn weight(&self, d: Vec3, squared: f32, point_normal: Vec3, openness: f32) -> f32;
 }
 
 impl<F: Formula> Weigh for Mean<F> {
@@ -278,7 +290,7 @@ impl<F: Formula> Weigh for Mean<F> {
             self.nearest_squared = squared;
             self.nearest = openness;
         }
-        let weight = self.formula.weight(d, squared, point_normal);
+        let weight = self.formula.weight(d, squared, point_normal, openness);
         self.weight += weight;
         self.sum += weight * openness;
     }
@@ -311,91 +323,100 @@ impl<const NEAREST: bool> Formula for Paper<NEAREST> {
         Paper { radius, normal }
     }
 
-    fn weight(&self, d: Vec3, squared: f32, point_normal: Vec3) -> f32 {
+    fn weight(&self, d: Vec3, squared: f32, point_normal: Vec3, _: f32) -> f32 {
         let along = point_normal.dot(d);
-        if point_normal.dot(self.normal) <= T_N
-            || along * along >= T_D * squared && squared > 0.0
-        {
+        if point_normal.dot(self.normal) <= T_N || along * along >= T_D * squared && squared > 0.0 {
             return 0.0;
         }
         ((self.radius - squared.sqrt()) / self.radius).max(0.0)
     }
 }
 
-/// The planar kernel; with `FADE` (in 1/100 cells) above 0 a cell's points fade out before the
-/// block leaves the cell. `SOFT`: points that face the same way count a little wherever they are.
-pub struct Planar<const FADE: u32, const SOFT: bool, const POWER: u32> {
+/// What `planar` was: a band of 0.3 radii around the plane, points within the radius alone.
+pub struct Band {
     normal: Vec3,
     inverse_radius_squared: f32,
-    inverse_band_squared: f32,
-    sides: [[f32; 2]; 3],
-    side: f32,
 }
 
-/// How much of a cell's points counts, below and above, for a fragment at `place`.
-fn sides(place: Vec3, fade: f32) -> [[f32; 2]; 3] {
-    place
-        .to_array()
-        .map(|at| [(1.5 - at) / fade, (at - 0.5) / fade].map(|s| s.clamp(0.0, 1.0)))
-}
-
-impl<const FADE: u32, const SOFT: bool, const POWER: u32> Formula for Planar<FADE, SOFT, POWER> {
+impl Formula for Band {
     const NEAREST: bool = true;
 
-    fn new(radius: f32, normal: Vec3, place: Vec3) -> Self {
-        let band = PLANE_BAND * radius;
-        Planar {
+    fn new(radius: f32, normal: Vec3, _: Vec3) -> Self {
+        Band {
             normal,
             inverse_radius_squared: 1.0 / (radius * radius),
-            inverse_band_squared: 1.0 / (band * band),
-            sides: sides(place, FADE as f32 / 100.0),
-            side: 1.0,
         }
     }
 
-    fn enter(&mut self, corner: usize) {
-        if FADE > 0 {
-            let [x, y, z] = self.sides;
-            self.side = x[corner & 1] * y[corner >> 1 & 1] * z[corner >> 2];
-        }
-    }
-
-    fn weight(&self, d: Vec3, squared: f32, point_normal: Vec3) -> f32 {
+    fn weight(&self, d: Vec3, squared: f32, point_normal: Vec3, _: f32) -> f32 {
         let agree = point_normal.dot(self.normal);
         if agree <= T_N {
             return 0.0;
         }
         let h = self.normal.dot(d).abs().max(point_normal.dot(d).abs());
         let near = (1.0 - squared * self.inverse_radius_squared).max(0.0);
-        let h2 = h * h * self.inverse_band_squared;
-        let flat = (1.0 - h2).max(0.0);
+        let flat = (1.0 - h * h * self.inverse_radius_squared / 0.09).max(0.0);
+        near * flat * agree.powi(8)
+    }
+}
+
+/// The core's planar kernel, or what is left of it without fading cells, or with dark points
+/// counting as others do.
+pub struct Planar<const FADES: bool, const HIDES: bool> {
+    normal: Vec3,
+    inverse_radius_squared: f32,
+    sides: [[f32; 2]; 3],
+    side: f32,
+}
+
+impl<const FADES: bool, const HIDES: bool> Formula for Planar<FADES, HIDES> {
+    const NEAREST: bool = false;
+
+    fn new(radius: f32, normal: Vec3, place: Vec3) -> Self {
+        let left = |at: f32| [1.5 - at, at - 0.5].map(|left| (left / FADE).clamp(0.0, 1.0));
+        Planar {
+            normal,
+            inverse_radius_squared: 1.0 / (radius * radius),
+            sides: place.to_array().map(left),
+            side: 1.0,
+        }
+    }
+
+    fn enter(&mut self, corner: usize) {
+        if FADES {
+            let [x, y, z] = self.sides;
+            self.side = x[corner & 1] * y[corner >> 1 & 1] * z[corner >> 2];
+        }
+    }
+
+    fn weight(&self, d: Vec3, squared: f32, point_normal: Vec3, openness: f32) -> f32 {
+        let agree = point_normal.dot(self.normal).max(T_N);
+        let h = self.normal.dot(d).abs().max(point_normal.dot(d).abs());
+        let far = CORE + (squared + FLATNESS * (h * h)) * self.inverse_radius_squared;
+        let seen = if HIDES {
+            (openness * (1.0 / SEEN)).min(1.0) + UNSEEN
+        } else {
+            1.0
+        };
         let agree2 = agree * agree;
         let agree4 = agree2 * agree2;
-        let power = if POWER == 8 { agree4 * agree4 } else { agree4 };
-        let mut w = near * flat * power;
-        if SOFT {
-            let s = 1.0 / (0.05 + squared * self.inverse_radius_squared + h2);
-            w += 1e-4 * agree4 * s * s;
-        }
-        self.side * w
+        self.side * seen * agree4 * agree4 / (far * far)
     }
 }
 
 /// Moving least squares in the tangent plane: a plane through the points' values, held back by a
 /// ridge and kept within the range of what it blends.
-pub struct LeastSquares<const FADE: u32> {
-    formula: Planar<FADE, false, 8>,
+pub struct LeastSquares {
+    formula: Planar<true, true>,
     axes: [Vec3; 2],
     radius: f32,
     weight: f32,
     /// Sums of u, v, uu, uv, vv, o, uo, vo.
     sums: [f32; 8],
     range: [f32; 2],
-    nearest: f32,
-    nearest_squared: f32,
 }
 
-impl<const FADE: u32> Weigh for LeastSquares<FADE> {
+impl Weigh for LeastSquares {
     fn new(radius: f32, normal: Vec3, place: Vec3) -> Self {
         let (u, v) = if normal == Vec3::ZERO {
             (Vec3::X, Vec3::Y)
@@ -409,8 +430,6 @@ impl<const FADE: u32> Weigh for LeastSquares<FADE> {
             weight: 0.0,
             sums: [0.0; 8],
             range: [1.0, 0.0],
-            nearest: 1.0,
-            nearest_squared: f32::INFINITY,
         }
     }
 
@@ -419,29 +438,20 @@ impl<const FADE: u32> Weigh for LeastSquares<FADE> {
     }
 
     fn add(&mut self, d: Vec3, point_normal: Vec3, o: f32) {
-        let squared = d.length_squared();
-        if squared < self.nearest_squared {
-            self.nearest_squared = squared;
-            self.nearest = o;
-        }
-        let w = self.formula.weight(d, squared, point_normal);
-        if w > 0.0 {
-            let [u, v] = self.axes.map(|axis| axis.dot(d));
-            self.weight += w;
-            let terms = [u, v, u * u, u * v, v * v, o, u * o, v * o];
-            self.sums.iter_mut().zip(terms).for_each(|(sum, t)| *sum += w * t);
-            self.range = [self.range[0].min(o), self.range[1].max(o)];
-        }
+        let w = self.formula.weight(d, d.length_squared(), point_normal, o);
+        let [u, v] = self.axes.map(|axis| axis.dot(d));
+        self.weight += w;
+        let terms = [u, v, u * u, u * v, v * v, o, u * o, v * o];
+        self.sums
+            .iter_mut()
+            .zip(terms)
+            .for_each(|(sum, t)| *sum += w * t);
+        self.range = [self.range[0].min(o), self.range[1].max(o)];
     }
 
     fn answer(&self) -> Blended {
-        let hole = self.weight <= 0.0;
-        if hole {
-            return Blended {
-                openness: self.nearest,
-                hole,
-                fetched: 0,
-            };
+        if self.weight <= 0.0 {
+            return Blended::default();
         }
         let [u, v, uu, uv, vv, o, uo, vo] = self.sums.map(|sum| sum / self.weight);
         let ridge = 0.03 * self.radius * self.radius;
@@ -449,11 +459,101 @@ impl<const FADE: u32> Weigh for LeastSquares<FADE> {
         let (p, q) = (uo - u * o, vo - v * o);
         let det = a * c - b * b;
         let (su, sv) = ((p * c - q * b) / det, (q * a - p * b) / det);
-        let openness = (o - su * u - sv * v).clamp(self.range[0], self.range[1]);
         Blended {
-            openness,
-            hole,
+            openness: (o - su * u - sv * v).clamp(self.range[0], self.range[1]),
+            hole: false,
             fetched: 0,
+        }
+    }
+}
+
+/// Finds out alone whether any point faces the fragment's way.
+pub struct Facing {
+    normal: Vec3,
+    any: bool,
+}
+
+impl Weigh for Facing {
+    fn new(_: f32, normal: Vec3, _: Vec3) -> Self {
+        Facing { normal, any: false }
+    }
+
+    fn enter(&mut self, _: usize) {}
+
+    fn add(&mut self, _: Vec3, point_normal: Vec3, _: f32) {
+        self.any |= point_normal.dot(self.normal) > T_N;
+    }
+
+    fn answer(&self) -> Blended {
+        Blended {
+            hole: !self.any,
+            ..Blended::default()
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use psao_core::{Kernel, Lookup};
+
+    #[test]
+    fn kernels_of_the_core_answer_here_as_they_do_there() {
+        let mut random = 1u64;
+        let mut next = || {
+            random = random
+                .wrapping_mul(6_364_136_223_846_793_005)
+                .wrapping_add(1);
+            (random >> 40) as f32 / (1 << 24) as f32
+        };
+        let point = |at: [f32; 4]| Sample {
+            position: Vec3::new(at[0], at[1] * 0.1, at[2]),
+            normal: Vec3::new(0.2 - at[3], 1.0, at[0]).normalize(),
+            occlusion: (at[3] * 255.0) as u8,
+            level: 0,
+        };
+        let points = (0..2000)
+            .map(|_| point(std::array::from_fn(|_| next())))
+            .collect();
+        let set = Samples {
+            instance: 0,
+            scale: Vec3::ONE,
+            points,
+        };
+        let grids = Grids::<7>::new(1, &[set], 0.07, 1.25, 7);
+        assert!(grids.discarded > 0 && grids.cells.len() > 100);
+        let cells: Vec<psao_core::Cell> = (grids.cells.iter())
+            .map(|cell| psao_core::Cell {
+                key: cell.key,
+                points: cell.points,
+            })
+            .collect();
+        let lookup = Lookup {
+            instances: &grids.instances,
+            buckets: &grids.buckets,
+            cells: &cells,
+        };
+        for _ in 0..2000 {
+            let at = Vec3::new(next(), next() * 0.1, next());
+            let normal = Vec3::new(next() - 0.5, 1.0, next());
+            let core = |kernel| lookup.blend(kernel, 0, at.to_array(), normal.to_array());
+            let pairs = [
+                (
+                    core(Kernel::Paper),
+                    grids.blend::<Mean<Paper<false>>>(0, at, normal),
+                ),
+                (
+                    core(Kernel::Planar),
+                    grids.blend::<Mean<Planar<true, true>>>(0, at, normal),
+                ),
+            ];
+            for (core, here) in pairs {
+                assert_eq!(core.fetched, here.fetched);
+                assert!(
+                    (core.openness - here.openness).abs() < 1e-4,
+                    "{core:?} {here:?}"
+                );
+            }
         }
     }
 }
