@@ -2,9 +2,9 @@
 
 use glam::Vec3;
 use psao::{Client, Config};
-use psao_core::mirror::{Buffer, Capacity};
+use psao_core::mirror::{Borrowed, Buffer, Capacity, PartsMut};
 use psao_core::residual::Quantiser;
-use psao_core::{Kernel, Mirror};
+use psao_core::{Bucket, Cell, Kernel, Mirror};
 use psao_gpu::wgpu::{self, PollType, TextureFormat, TextureUsages};
 use psao_gpu::{Buffers, Pass, Tier};
 use psao_server::args::camera_path;
@@ -554,21 +554,73 @@ fn only_what_changed_is_uploaded_and_then_the_gpu_has_the_mirror() {
             "nothing is left to upload"
         );
         let mirror = client.mirror();
-        let parts: [(Buffer, &[u8]); 3] = [
-            (Buffer::Instances, bytemuck::cast_slice(mirror.instances())),
-            (Buffer::Buckets, bytemuck::cast_slice(mirror.buckets())),
-            (Buffer::Cells, bytemuck::cast_slice(mirror.cells())),
-        ];
-        for (kind, expected) in parts {
-            let got = gpu.read(buffers.buffer(kind));
-            assert!(got.starts_with(expected), "frame {frame}: {kind:?}");
-        }
+        assert_holds(&buffers, mirror, &format!("frame {frame}"));
     }
     let all = mirror_bytes(client.mirror());
     assert!(
         later < 23 * all / 4,
         "{later} bytes in 23 frames, of {all} a whole upload"
     );
+}
+
+/// The GPU's buffers are the mirror's, with a tag in each entry of a bucket.
+fn assert_holds<M: psao_core::mirror::Memory>(buffers: &Buffers, mirror: &Mirror<M>, when: &str) {
+    let mut tagged = mirror.buckets().to_vec();
+    for entry in tagged.iter_mut().flat_map(|bucket| &mut bucket.entries) {
+        if *entry != 0 {
+            let key = mirror.cells()[*entry as usize].key;
+            *entry |= (key.wrapping_mul(0x9e37_79b1) >> 22).max(1) << 22;
+        }
+    }
+    let parts: [(Buffer, &[u8]); 3] = [
+        (Buffer::Instances, bytemuck::cast_slice(mirror.instances())),
+        (Buffer::Buckets, bytemuck::cast_slice(&tagged)),
+        (Buffer::Cells, bytemuck::cast_slice(mirror.cells())),
+    ];
+    for (kind, expected) in parts {
+        let got = GPU.read(buffers.buffer(kind));
+        assert!(got.starts_with(expected), "{when}: {kind:?}");
+    }
+}
+
+#[test]
+fn a_cell_that_gets_another_key_in_the_same_entry_gets_another_tag() {
+    let gpu = &*GPU;
+    let capacity = Capacity {
+        instances: 1,
+        buckets: 4,
+        cells: 8,
+        ..Capacity::default()
+    };
+    let mut memory = (
+        vec![Default::default(); 1],
+        vec![Bucket::default(); 4],
+        vec![Cell::default(); 8],
+    );
+    let mut dirty = vec![0; capacity.dirty_words()];
+    let mut mirror = Mirror::new(Borrowed(PartsMut {
+        instances: &mut memory.0,
+        buckets: &mut memory.1,
+        cells: &mut memory.2,
+        dirty: &mut dirty,
+    }));
+    let mut buffers = Buffers::new(&gpu.device, capacity).unwrap();
+    let entries = [3, 5, 0, 0, 0, 0, 0, 0];
+    mirror.set_bucket(2, Bucket { entries }).unwrap();
+    for (cell, keys) in [(3, [7, 7, 100]), (5, [9, 2000, 9])] {
+        let with_key = |key| Cell {
+            key,
+            ..Cell::default()
+        };
+        for key in keys {
+            mirror.set_cell(cell, with_key(key)).unwrap();
+            let mut encoder = gpu.encoder();
+            buffers.upload(&mut encoder, &mirror);
+            gpu.submit(encoder);
+            mirror.clear_dirty();
+            assert_holds(&buffers, &mirror, &format!("cell {cell} with key {key}"));
+        }
+    }
 }
 
 fn mirror_bytes<M: psao_core::mirror::Memory>(mirror: &Mirror<M>) -> u64 {

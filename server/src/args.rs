@@ -57,6 +57,15 @@ pub enum KernelArg {
     Paper,
 }
 
+/// How points are spread, by name.
+#[derive(ValueEnum, Clone, Copy, Debug, PartialEq, Eq)]
+pub enum PlacementArg {
+    /// Evenly over all surfaces
+    Uniform,
+    /// Denser where occlusion changes fast
+    Adaptive,
+}
+
 /// Compression by name.
 #[derive(ValueEnum, Clone, Copy, Debug, PartialEq, Eq)]
 pub enum CompressionArg {

@@ -65,6 +65,12 @@ fn main() -> ExitCode {
         Command::Inspect(args) => {
             commands::inspect(args, &mut std::io::stdout().lock()).map(|()| String::new())
         }
+        Command::Eval(args) if !args.kernels.is_empty() => {
+            eval::kernels::run(args, &progress).map(|found| {
+                bars.finish();
+                found.table()
+            })
+        }
         Command::Eval(args) => eval::run(args, &progress).map(|found| {
             bars.finish();
             found.table()

@@ -21,7 +21,7 @@ pub struct Fragment {
     /// Shading normal in that space, towards the viewer's side of a double-sided surface.
     pub normal: Vec3,
     /// World position, metres from the scene's origin.
-    pub(crate) world_position: Vec3,
+    pub world_position: Vec3,
     pub(crate) world_normal: Vec3,
     /// Normal of the flat triangle, in the world.
     pub(crate) outward: Vec3,

@@ -9,6 +9,9 @@ use wgpu::util::StagingBelt;
 /// Instances, buckets and cells on the GPU, as large as the stream may ever need: they never grow
 /// and never move, so bind groups stay valid.
 ///
+/// They are the mirror's, but for a tag of its key above each cell's index in a bucket: it spares
+/// [`crate::Tier::Fast`] from reading cells that it does not look for.
+///
 /// Use it from one thread at a time.
 #[derive(Debug)]
 pub struct Buffers {
@@ -18,16 +21,26 @@ pub struct Buffers {
     group: wgpu::BindGroup,
     capacity: Capacity,
     belt: StagingBelt,
+    tags: Tags,
 }
 
-/// A buffer is larger than the device can bind.
+/// What the buckets on the GPU say of the cells.
+#[derive(Debug)]
+struct Tags {
+    /// The bucket that names a cell, and the tag that it has there; 0 for none.
+    of_cells: Vec<(u32, u16)>,
+    /// Buckets of a run, with tags.
+    run: Vec<Bucket>,
+}
+
+/// A buffer is larger than the device can bind, or than entries of buckets can name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct TooLarge {
     /// Which one.
     pub buffer: &'static str,
     /// What it needs.
     pub bytes: u64,
-    /// What the device allows.
+    /// What is possible.
     pub limit_bytes: u64,
 }
 
@@ -35,9 +48,9 @@ impl fmt::Display for TooLarge {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(
             f,
-            "{} need {} bytes, but the device was requested with max_storage_buffer_binding_size \
-             and max_buffer_size of at most {}: request it with larger limits, or stream with a \
-             lower density",
+            "{} need {} bytes, more than the {} that are possible (at most 128 MiB, and the \
+             max_storage_buffer_binding_size and max_buffer_size that the device was requested \
+             with): request it with larger limits, or stream with a lower density",
             self.buffer, self.bytes, self.limit_bytes
         )
     }
@@ -55,6 +68,9 @@ pub struct Uploaded {
     /// Copies.
     pub copies: u32,
 }
+
+/// A bucket's entry has this many bits for the cell's index: a cell buffer of 128 MiB.
+const INDEX_BITS: u32 = 22;
 
 const NAMES: [&str; 3] = ["psao instances", "psao buckets", "psao cells"];
 const KINDS: [Buffer; 3] = [Buffer::Instances, Buffer::Buckets, Buffer::Cells];
@@ -81,7 +97,8 @@ impl Buffers {
         let limits = device.limits();
         let limit_bytes = limits
             .max_storage_buffer_binding_size
-            .min(limits.max_buffer_size);
+            .min(limits.max_buffer_size)
+            .min(STRIDES[2] << INDEX_BITS);
         // At least one of each: an empty buffer cannot be bound.
         let sizes: [u64; 3] =
             std::array::from_fn(|kind| u64::from(counts[kind].max(1)) * STRIDES[kind]);
@@ -129,6 +146,10 @@ impl Buffers {
         });
         Ok(Buffers {
             belt: StagingBelt::new(device.clone(), CHUNK_BYTES),
+            tags: Tags {
+                of_cells: vec![(0, 0); capacity.cells as usize],
+                run: vec![Bucket::default(); CHUNK_BYTES as usize / size_of::<Bucket>()],
+            },
             device: device.clone(),
             buffers,
             layout,
@@ -155,32 +176,47 @@ impl Buffers {
             "the mirror is larger than the buffers made for it"
         );
         let mut done = Uploaded::default();
-        let contents: [&[u8]; 3] = [
-            bytemuck::cast_slice(mirror.instances()),
-            bytemuck::cast_slice(mirror.buckets()),
-            bytemuck::cast_slice(mirror.cells()),
-        ];
-        for kind in 0..3 {
-            let mut pending: Option<Range<u64>> = None;
-            for run in mirror.dirty_runs(KINDS[kind]) {
-                let run = u64::from(run.start) * STRIDES[kind]..u64::from(run.end) * STRIDES[kind];
-                done.dirty_bytes += run.end - run.start;
+        for kind in KINDS {
+            let mut pending: Option<Range<u32>> = None;
+            for run in mirror.dirty_runs(kind) {
+                let stride = STRIDES[kind as usize];
+                let bytes = |range: Range<u32>| u64::from(range.end - range.start) * stride;
+                done.dirty_bytes += bytes(run.clone());
                 pending = match pending {
-                    Some(before) if done.affords(run.end - before.end) => {
-                        done.bytes += run.end - before.end;
+                    Some(before) if done.affords(bytes(before.end..run.end)) => {
+                        done.bytes += bytes(before.end..run.end);
                         Some(before.start..run.end)
                     }
                     before => {
-                        done.bytes += run.end - run.start;
+                        done.bytes += bytes(run.clone());
                         if let Some(before) = before {
-                            self.copy(encoder, kind, contents[kind], before, &mut done);
+                            self.copy(encoder, kind, mirror, before, &mut done);
                         }
                         Some(run)
                     }
                 };
             }
             if let Some(last) = pending {
-                self.copy(encoder, kind, contents[kind], last, &mut done);
+                self.copy(encoder, kind, mirror, last, &mut done);
+            }
+        }
+        // A cell may have got another key in the same entry of the same bucket.
+        for index in mirror.dirty_runs(Buffer::Cells).flatten() {
+            let (bucket, tag) = self.tags.of_cells[index as usize];
+            let named = |bucket: &Bucket| bucket.cells().any(|entry| entry == index);
+            if tag != 0
+                && tag != tag_of(mirror.cells()[index as usize].key)
+                && mirror.buckets().get(bucket as usize).is_some_and(named)
+            {
+                done.dirty_bytes += size_of::<Bucket>() as u64;
+                done.bytes += size_of::<Bucket>() as u64;
+                self.copy(
+                    encoder,
+                    Buffer::Buckets,
+                    mirror,
+                    bucket..bucket + 1,
+                    &mut done,
+                );
             }
         }
         self.belt.finish_and_recall_on_submit(encoder);
@@ -190,20 +226,36 @@ impl Buffers {
         done
     }
 
-    fn copy(
+    fn copy<M: Memory>(
         &mut self,
         encoder: &mut wgpu::CommandEncoder,
-        kind: usize,
-        contents: &[u8],
-        range: Range<u64>,
+        kind: Buffer,
+        mirror: &Mirror<M>,
+        range: Range<u32>,
         done: &mut Uploaded,
     ) {
-        for start in range.clone().step_by(CHUNK_BYTES as usize) {
-            let end = range.end.min(start + CHUNK_BYTES);
-            let size = wgpu::BufferSize::new(end - start).expect("a run is not empty");
+        let stride = STRIDES[kind as usize];
+        let at_once = CHUNK_BYTES / stride;
+        for start in range.clone().step_by(at_once as usize) {
+            let (start, end) = (
+                start as usize,
+                range.end.min(start + at_once as u32) as usize,
+            );
+            let bytes: &[u8] = match kind {
+                Buffer::Instances => bytemuck::cast_slice(&mirror.instances()[start..end]),
+                Buffer::Buckets => {
+                    let tagged =
+                        self.tags
+                            .tag(mirror.cells(), &mirror.buckets()[start..end], start);
+                    bytemuck::cast_slice(tagged)
+                }
+                Buffer::Cells => bytemuck::cast_slice(&mirror.cells()[start..end]),
+            };
+            let size = wgpu::BufferSize::new(bytes.len() as u64).expect("a run is not empty");
+            let offset = start as u64 * stride;
             self.belt
-                .write_buffer(encoder, &self.buffers[kind], start, size)
-                .copy_from_slice(&contents[start as usize..end as usize]);
+                .write_buffer(encoder, &self.buffers[kind as usize], offset, size)
+                .copy_from_slice(bytes);
             done.copies += 1;
         }
     }
@@ -219,11 +271,34 @@ impl Buffers {
         &self.group
     }
 
-    /// One of the buffers: for engines with bindings of their own.
+    /// One of the buffers: for engines with bindings of their own. What it holds of the mirror is
+    /// told at [`Buffers`].
     pub fn buffer(&self, kind: Buffer) -> &wgpu::Buffer {
-        let at = KINDS.iter().position(|known| *known == kind);
-        &self.buffers[at.expect("all kinds are listed")]
+        &self.buffers[kind as usize]
     }
+}
+
+impl Tags {
+    /// The buckets of a run that begins at `first`, each entry with its cell's tag, no longer than
+    /// a chunk.
+    fn tag(&mut self, cells: &[Cell], buckets: &[Bucket], first: usize) -> &[Bucket] {
+        let tagged = &mut self.run[..buckets.len()];
+        for (at, (tagged, bucket)) in tagged.iter_mut().zip(buckets).enumerate() {
+            *tagged = *bucket;
+            for entry in tagged.entries.iter_mut().take_while(|entry| **entry != 0) {
+                // A mirror's buckets name only cells that it has.
+                let tag = tag_of(cells[*entry as usize].key);
+                self.of_cells[*entry as usize] = ((first + at) as u32, tag);
+                *entry |= u32::from(tag) << INDEX_BITS;
+            }
+        }
+        tagged
+    }
+}
+
+/// `psao_tag` of psao.wgsl.
+fn tag_of(key: u32) -> u16 {
+    (key.wrapping_mul(0x9e37_79b1) >> INDEX_BITS).max(1) as u16
 }
 
 impl Uploaded {

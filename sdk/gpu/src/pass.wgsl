@@ -41,12 +41,19 @@ fn psao_pass_planar(@builtin(global_invocation_id) id: vec3<u32>) {
     textureStore(psao_openness, id.xy, vec4<f32>(openness));
 }
 
-@compute @workgroup_size(8, 8)
-fn psao_pass_fast(@builtin(global_invocation_id) id: vec3<u32>) {
-    let pixel = psao_pixel(id.xy);
+@compute @workgroup_size(64)
+fn psao_pass_fast(
+    @builtin(workgroup_id) tile: vec3<u32>,
+    @builtin(local_invocation_index) thread: u32,
+) {
+    // Threads that run side by side have pixels in a square, not in a row: they share more cells.
+    let x = (thread & 3u) | ((thread >> 1u) & 4u);
+    let y = ((thread >> 2u) & 1u) | ((thread >> 3u) & 6u);
+    let at = tile.xy * 8u + vec2<u32>(x, y);
+    let pixel = psao_pixel(at);
     var openness = 1.0;
     if !pixel.empty {
         openness = psao_planar_fast(pixel.instance, pixel.position, pixel.normal);
     }
-    textureStore(psao_openness, id.xy, vec4<f32>(openness));
+    textureStore(psao_openness, at, vec4<f32>(openness));
 }

@@ -36,9 +36,22 @@ struct PsaoFragment {
     bool outside;
 };
 
+struct PsaoSum {
+    float weights;
+    float sum;
+    float nearest;
+    float nearest_squared;
+};
+
+struct PsaoCandidate {
+    uint cell;
+    bool unsure;
+};
+
 static const float PSAO_T_N = 0.1;
 static const float PSAO_T_D = 0.7;
 static const float PSAO_PLANE_BAND = 0.3;
+static const uint PSAO_ENTRY_CELL = 4194303u;
 static const float PSAO_FAR = 1e30;
 
 ByteAddressBuffer psao_instances : register(t0);
@@ -94,7 +107,7 @@ PsaoFragment ConstructPsaoFragment(int3 arg0, float3 arg1, float3 arg2, bool arg
     return ret;
 }
 
-int3 naga_f2i32(float3 value) {
+int3 psao_naga_f2i32(float3 value) {
     return int3(clamp(value, -2147483600.0, 2147483500.0));
 }
 
@@ -120,7 +133,7 @@ PsaoFragment psao_fragment(PsaoGrid grid, float3 position_1, float3 normal_1)
         local_1 = true;
     }
     bool _e65 = local_1;
-    const PsaoFragment psaofragment = ConstructPsaoFragment(naga_f2i32(lower), (g - lower), (n * ((squared > 0.0) ? rsqrt(squared) : 0.0)), _e65);
+    const PsaoFragment psaofragment = ConstructPsaoFragment(psao_naga_f2i32(lower), (g - lower), (n * ((squared > 0.0) ? rsqrt(squared) : 0.0)), _e65);
     return psaofragment;
 }
 
@@ -129,7 +142,7 @@ uint psao_weigh(PsaoGrid grid_1, uint3 cell, uint weight_y, uint weight_z)
     return ((cell.x + ((cell.y * grid_1.dims.x) * weight_y)) + ((cell.z * (grid_1.dims.x * grid_1.dims.y)) * weight_z));
 }
 
-uint naga_mod(uint lhs, uint rhs) {
+uint psao_naga_mod(uint lhs, uint rhs) {
     return lhs % (rhs == 0u ? 1u : rhs);
 }
 
@@ -139,12 +152,12 @@ uint psao_find(PsaoGrid grid_2, uint3 cell_1)
 
     const uint _e4 = psao_weigh(grid_2, cell_1, 1u, 1u);
     const uint _e8 = psao_weigh(grid_2, cell_1, 17u, 31u);
-    uint bucket = (grid_2.bucket_first + naga_mod(_e8, grid_2.bucket_count));
+    uint bucket = (grid_2.bucket_first + psao_naga_mod(_e8, grid_2.bucket_count));
     bool loop_init = true;
     while(true) {
         if (!loop_init) {
-            uint _e35 = i;
-            i = (_e35 + 1u);
+            uint _e37 = i;
+            i = (_e37 + 1u);
         }
         loop_init = false;
         uint _e14 = i;
@@ -156,12 +169,12 @@ uint psao_find(PsaoGrid grid_2, uint3 cell_1)
             uint _e19 = i;
             const uint4 _e23 = psao_load_bucket(((bucket * 2u) + (_e19 >> 2u)));
             uint _e24 = i;
-            uint entry = _e23[(_e24 & 3u)];
+            uint entry = (_e23[(_e24 & 3u)] & PSAO_ENTRY_CELL);
             if ((entry == 0u)) {
                 break;
             }
-            const uint4 _e32 = psao_load_cell((entry * 2u));
-            if ((_e32.x == _e4)) {
+            const uint4 _e34 = psao_load_cell((entry * 2u));
+            if ((_e34.x == _e4)) {
                 return entry;
             }
         }
@@ -261,11 +274,11 @@ float psao_blend(bool planar, uint instance_2, float3 position_2, float3 normal_
             uint _e22 = corner;
             uint _e25 = corner;
             uint3 offset = (uint3(_e21, (_e22 >> 1u), (_e25 >> 2u)) & (1u).xxx);
-            uint3 cell_2 = (uint3(_e5.base) + offset);
-            if (any((cell_2 >= _e4.dims))) {
+            uint3 cell_3 = (uint3(_e5.base) + offset);
+            if (any((cell_3 >= _e4.dims))) {
                 continue;
             }
-            const uint _e38 = psao_find(_e4, cell_2);
+            const uint _e38 = psao_find(_e4, cell_3);
             if ((_e38 == 0u)) {
                 continue;
             }
@@ -287,17 +300,17 @@ float psao_blend(bool planar, uint instance_2, float3 position_2, float3 normal_
                     uint _e51 = i_1;
                     const uint4 _e55 = psao_load_cell(((_e38 * 2u) + (_e51 >> 2u)));
                     uint _e56 = i_1;
-                    uint point_3 = _e55[(_e56 & 3u)];
-                    if ((point_3 == 0u)) {
+                    uint point_4 = _e55[(_e56 & 3u)];
+                    if ((point_4 == 0u)) {
                         break;
                     }
-                    if ((point_3 < 2147483648u)) {
+                    if ((point_4 < 2147483648u)) {
                         continue;
                     }
-                    const float3 _e64 = psao_point_place(point_3);
+                    const float3 _e64 = psao_point_place(point_4);
                     float3 d_2 = (corner_from + _e64);
-                    const float3 _e66 = psao_point_normal(point_3);
-                    const float _e67 = psao_point_openness(point_3);
+                    const float3 _e66 = psao_point_normal(point_4);
+                    const float _e67 = psao_point_openness(point_4);
                     float squared_2 = dot(d_2, d_2);
                     float _e69 = nearest_squared;
                     if ((squared_2 < _e69)) {
@@ -344,8 +357,285 @@ float psao_paper(uint instance_4, float3 position_4, float3 normal_6)
     return _e4;
 }
 
-float psao_planar_fast(uint instance_5, float3 position_5, float3 normal_7)
+uint psao_tag(uint key)
 {
-    const float _e4 = psao_blend(true, instance_5, position_5, normal_7);
-    return _e4;
+    return max(((key * 2654435761u) >> 22u), 1u);
+}
+
+uint psao_naga_f2u32(float value) {
+    return uint(clamp(value, 0.0, 4294967000.0));
+}
+
+uint psao_modulo(uint hash, uint count, float inverse)
+{
+    uint left_1 = (hash - (psao_naga_f2u32(((float(hash) * inverse) * 0.999999)) * count));
+    uint rest = (left_1 - (psao_naga_f2u32((float(left_1) * inverse)) * count));
+    uint raised = ((rest >= 2147483648u) ? (rest + count) : rest);
+    return ((raised >= count) ? (raised - count) : raised);
+}
+
+void psao_add(inout PsaoSum total, float2 radius_terms, float3 normal_7, float3 place, uint point_3)
+{
+    int3 steps_1 = int3(((point_3).xxx & uint3(2031616u, 65011712u, 2080374784u)));
+    float3 scale = float3(4.7683716e-7, 1.4901161e-8, 4.656613e-10);
+    float3 d_3 = ((float3(steps_1) * scale) - place);
+    int2 codes_1 = int2((uint2((point_3 >> 8u), (point_3 >> 12u)) & (15u).xx));
+    float2 uv_1 = (float2(min(codes_1, (int(14)).xx)) - (7.0).xx);
+    float z_1 = ((7.0 - abs(uv_1.x)) - abs(uv_1.y));
+    float fold = max(-(z_1), 0.0);
+    float3 m = float3((uv_1 - ((uv_1 < (0.0).xx) ? (-(fold)).xx : (fold).xx)), z_1);
+    float inverse_1 = (1.0 / dot(m, m));
+    float squared_3 = ((point_3 >= 2147483648u) ? dot(d_3, d_3) : PSAO_FAR);
+    float openness = float(int((point_3 & 255u)));
+    float _e67 = total.nearest_squared;
+    bool closer = (squared_3 < _e67);
+    float _e71 = total.nearest;
+    total.nearest = (closer ? openness : _e71);
+    float _e75 = total.nearest_squared;
+    total.nearest_squared = min(_e75, squared_3);
+    float agree_1 = dot(m, normal_7);
+    float agree2_1 = ((agree_1 > 0.0) ? ((agree_1 * agree_1) * inverse_1) : 0.0);
+    float along_1 = dot(normal_7, d_3);
+    float point_along = dot(m, d_3);
+    float h2_ = max((along_1 * along_1), ((point_along * point_along) * inverse_1));
+    float near_1 = max((1.0 - (squared_3 * radius_terms.x)), 0.0);
+    float flatness_1 = max((1.0 - (h2_ * radius_terms.y)), 0.0);
+    float agree4_1 = (agree2_1 * agree2_1);
+    float weight_1 = (((near_1 * flatness_1) * agree4_1) * agree4_1);
+    float counted = ((agree2_1 > 0.010000001) ? weight_1 : 0.0);
+    float _e111 = total.weights;
+    total.weights = (_e111 + counted);
+    float _e114 = total.sum;
+    total.sum = (_e114 + (counted * openness));
+    return;
+}
+
+PsaoCandidate ConstructPsaoCandidate(uint arg0, bool arg1) {
+    PsaoCandidate ret = (PsaoCandidate)0;
+    ret.cell = arg0;
+    ret.unsure = arg1;
+    return ret;
+}
+
+PsaoCandidate psao_pick(uint4 entries, uint tag)
+{
+    uint4 tags = (entries >> (22u).xxxx);
+    bool4 may = ((tags == (tag).xxxx) | (tags == (0u).xxxx));
+    uint4 cells = ((entries & (4194303u).xxxx) & ((0u).xxxx - uint4(may)));
+    uint sum_1 = (((cells.x + cells.y) + cells.z) + cells.w);
+    const PsaoCandidate psaocandidate = ConstructPsaoCandidate(sum_1, (sum_1 != max(max(cells.x, cells.y), max(cells.z, cells.w))));
+    return psaocandidate;
+}
+
+PsaoCandidate psao_candidate(PsaoGrid grid_3, float inverse_count, uint3 cell_2)
+{
+    bool local_4 = (bool)0;
+    bool local_5 = (bool)0;
+    bool local_6 = (bool)0;
+
+    if (any((cell_2 >= grid_3.dims))) {
+        const PsaoCandidate psaocandidate_1 = ConstructPsaoCandidate(0u, false);
+        return psaocandidate_1;
+    }
+    const uint _e11 = psao_weigh(grid_3, cell_2, 1u, 1u);
+    const uint _e12 = psao_tag(_e11);
+    const uint _e15 = psao_weigh(grid_3, cell_2, 17u, 31u);
+    const uint _e18 = psao_modulo(_e15, grid_3.bucket_count, inverse_count);
+    uint bucket_1 = (grid_3.bucket_first + _e18);
+    const uint4 _e22 = psao_load_bucket((bucket_1 * 2u));
+    const PsaoCandidate _e23 = psao_pick(_e22, _e12);
+    if ((_e22.w == 0u)) {
+        const PsaoCandidate psaocandidate_2 = _e23;
+        return psaocandidate_2;
+    }
+    const uint4 _e31 = psao_load_bucket(((bucket_1 * 2u) + 1u));
+    const PsaoCandidate _e32 = psao_pick(_e31, _e12);
+    if ((_e23.cell != 0u)) {
+        local_4 = (_e32.cell != 0u);
+    } else {
+        local_4 = false;
+    }
+    bool both = local_4;
+    if (!(_e23.unsure)) {
+        local_5 = _e32.unsure;
+    } else {
+        local_5 = true;
+    }
+    bool _e52 = local_5;
+    if (!(_e52)) {
+        local_6 = both;
+    } else {
+        local_6 = true;
+    }
+    bool _e57 = local_6;
+    const PsaoCandidate psaocandidate_3 = ConstructPsaoCandidate((_e23.cell + _e32.cell), _e57);
+    return psaocandidate_3;
+}
+
+PsaoSum ConstructPsaoSum(float arg0, float arg1, float arg2, float arg3) {
+    PsaoSum ret = (PsaoSum)0;
+    ret.weights = arg0;
+    ret.sum = arg1;
+    ret.nearest = arg2;
+    ret.nearest_squared = arg3;
+    return ret;
+}
+
+float psao_planar_fast(uint instance_5, float3 position_5, float3 normal_8)
+{
+    bool local_7 = (bool)0;
+    bool local_8 = (bool)0;
+    bool local_9 = (bool)0;
+    bool local_10 = (bool)0;
+    bool local_11 = (bool)0;
+    bool local_12 = (bool)0;
+    bool local_13 = (bool)0;
+    uint left = (uint)0;
+    PsaoSum total_1 = ConstructPsaoSum(0.0, 0.0, 255.0, 1e30);
+    bool second = false;
+    uint4 words = (uint4)0;
+    bool local_14 = (bool)0;
+    bool local_15 = (bool)0;
+    bool local_16 = (bool)0;
+
+    const PsaoGrid _e3 = psao_grid(instance_5);
+    const PsaoFragment _e4 = psao_fragment(_e3, position_5, normal_8);
+    if (_e4.outside) {
+        return 1.0;
+    }
+    float inverse_count_1 = (1.0 / float(_e3.bucket_count));
+    uint3 base = uint3(_e4.base);
+    const PsaoCandidate _e13 = psao_candidate(_e3, inverse_count_1, base);
+    const PsaoCandidate _e19 = psao_candidate(_e3, inverse_count_1, (base + uint3(1u, 0u, 0u)));
+    const PsaoCandidate _e25 = psao_candidate(_e3, inverse_count_1, (base + uint3(0u, 1u, 0u)));
+    const PsaoCandidate _e31 = psao_candidate(_e3, inverse_count_1, (base + uint3(1u, 1u, 0u)));
+    const PsaoCandidate _e37 = psao_candidate(_e3, inverse_count_1, (base + uint3(0u, 0u, 1u)));
+    const PsaoCandidate _e43 = psao_candidate(_e3, inverse_count_1, (base + uint3(1u, 0u, 1u)));
+    const PsaoCandidate _e49 = psao_candidate(_e3, inverse_count_1, (base + uint3(0u, 1u, 1u)));
+    const PsaoCandidate _e55 = psao_candidate(_e3, inverse_count_1, (base + uint3(1u, 1u, 1u)));
+    if (!(_e13.unsure)) {
+        local_7 = _e19.unsure;
+    } else {
+        local_7 = true;
+    }
+    bool _e62 = local_7;
+    if (!(_e62)) {
+        local_8 = _e25.unsure;
+    } else {
+        local_8 = true;
+    }
+    bool _e68 = local_8;
+    if (!(_e68)) {
+        local_9 = _e31.unsure;
+    } else {
+        local_9 = true;
+    }
+    bool _e74 = local_9;
+    if (!(_e74)) {
+        local_10 = _e37.unsure;
+    } else {
+        local_10 = true;
+    }
+    bool _e80 = local_10;
+    if (!(_e80)) {
+        local_11 = _e43.unsure;
+    } else {
+        local_11 = true;
+    }
+    bool _e86 = local_11;
+    if (!(_e86)) {
+        local_12 = _e49.unsure;
+    } else {
+        local_12 = true;
+    }
+    bool _e92 = local_12;
+    if (!(_e92)) {
+        local_13 = _e55.unsure;
+    } else {
+        local_13 = true;
+    }
+    bool _e98 = local_13;
+    if (_e98) {
+        const float _e99 = psao_planar(instance_5, position_5, normal_8);
+        return _e99;
+    }
+    left = (((((((((_e13.cell != 0u) ? 1u : 0u) | ((_e19.cell != 0u) ? 2u : 0u)) | ((_e25.cell != 0u) ? 4u : 0u)) | ((_e31.cell != 0u) ? 8u : 0u)) | ((_e37.cell != 0u) ? 16u : 0u)) | ((_e43.cell != 0u) ? 32u : 0u)) | ((_e49.cell != 0u) ? 64u : 0u)) | ((_e55.cell != 0u) ? 128u : 0u));
+    float near_term = (1.0 / (_e3.radius * _e3.radius));
+    float2 radius_terms_1 = float2(near_term, (near_term / 0.09));
+    while(true) {
+        uint _e172 = left;
+        if ((_e172 != 0u)) {
+        } else {
+            break;
+        }
+        {
+            uint _e175 = left;
+            uint _e177 = left;
+            uint corner_1 = ((asuint(float(int((_e175 & (0u - _e177))))) >> 23u) - 127u);
+            uint3 offset_1 = (uint3(corner_1, (corner_1 >> 1u), (corner_1 >> 2u)) & (1u).xxx);
+            bool right = (offset_1.x != 0u);
+            bool back = (offset_1.y != 0u);
+            uint lower_1 = (back ? (right ? _e31.cell : _e25.cell) : (right ? _e19.cell : _e13.cell));
+            uint upper = (back ? (right ? _e55.cell : _e49.cell) : (right ? _e43.cell : _e37.cell));
+            uint found = ((offset_1.z != 0u) ? upper : lower_1);
+            bool _e223 = second;
+            const uint4 _e226 = psao_load_cell(((found * 2u) + (_e223 ? 1u : 0u)));
+            words = _e226;
+            bool _e228 = second;
+            if (!(_e228)) {
+                uint _e233 = words.x;
+                const uint _e237 = psao_weigh(_e3, (base + offset_1), 1u, 1u);
+                local_14 = (_e233 != _e237);
+            } else {
+                local_14 = false;
+            }
+            bool _e240 = local_14;
+            if (_e240) {
+                words = (0u).xxxx;
+            }
+            uint _e245 = words.x;
+            bool _e246 = second;
+            uint a = (_e246 ? _e245 : 0u);
+            uint _e249 = words.y;
+            bool _e251 = second;
+            if (_e251) {
+                local_15 = (a == 0u);
+            } else {
+                local_15 = false;
+            }
+            bool _e257 = local_15;
+            uint b = (_e257 ? 0u : _e249);
+            uint _e261 = words.z;
+            uint c = ((b != 0u) ? _e261 : 0u);
+            uint _e267 = words.w;
+            uint d_4 = ((c != 0u) ? _e267 : 0u);
+            float3 place_1 = ((_e4.place - (0.015625).xxx) - float3(int3(offset_1)));
+            bool _e278 = second;
+            if (_e278) {
+                psao_add(total_1, radius_terms_1, _e4.normal, place_1, a);
+            }
+            psao_add(total_1, radius_terms_1, _e4.normal, place_1, b);
+            psao_add(total_1, radius_terms_1, _e4.normal, place_1, c);
+            psao_add(total_1, radius_terms_1, _e4.normal, place_1, d_4);
+            bool _e283 = second;
+            if (!(_e283)) {
+                local_16 = (d_4 != 0u);
+            } else {
+                local_16 = false;
+            }
+            bool _e290 = local_16;
+            second = _e290;
+            uint _e291 = left;
+            uint _e292 = left;
+            uint _e296 = left;
+            bool _e297 = second;
+            left = (_e297 ? _e296 : (_e291 & (_e292 - 1u)));
+        }
+    }
+    float _e300 = total_1.nearest;
+    float _e302 = total_1.sum;
+    float _e304 = total_1.weights;
+    float _e307 = total_1.weights;
+    float openness_1 = ((_e307 > 0.0) ? (_e302 / _e304) : _e300);
+    return min((openness_1 * 0.003921569), 1.0);
 }

@@ -23,13 +23,7 @@
 
 using metal::uint;
 
-struct _mslBufferSizes {
-    uint size0;
-    uint size1;
-    uint size2;
-};
-
-typedef metal::uint4 type_2[1];
+typedef metal::uint4 PsaoWords[1];
 struct PsaoGrid {
     metal::packed_float3 origin;
     float radius;
@@ -46,15 +40,26 @@ struct PsaoFragment {
     bool outside;
     char _pad4[3];
 };
+struct PsaoSum {
+    float weights;
+    float sum;
+    float nearest;
+    float nearest_squared;
+};
+struct PsaoCandidate {
+    uint cell;
+    bool unsure;
+    char _pad2[3];
+};
 constant float PSAO_T_N = 0.1;
 constant float PSAO_T_D = 0.7;
 constant float PSAO_PLANE_BAND = 0.3;
+constant uint PSAO_ENTRY_CELL = 4194303u;
 constant float PSAO_FAR = 1000000000000000000000000000000.0;
 
 metal::uint4 psao_load_instance(
     uint index,
-    device type_2 const& psao_instances,
-    constant _mslBufferSizes& _buffer_sizes
+    device PsaoWords const& psao_instances
 ) {
     metal::uint4 _e3 = psao_instances[index];
     return _e3;
@@ -62,8 +67,7 @@ metal::uint4 psao_load_instance(
 
 metal::uint4 psao_load_bucket(
     uint index_1,
-    device type_2 const& psao_buckets,
-    constant _mslBufferSizes& _buffer_sizes
+    device PsaoWords const& psao_buckets
 ) {
     metal::uint4 _e3 = psao_buckets[index_1];
     return _e3;
@@ -71,8 +75,7 @@ metal::uint4 psao_load_bucket(
 
 metal::uint4 psao_load_cell(
     uint index_2,
-    device type_2 const& psao_cells,
-    constant _mslBufferSizes& _buffer_sizes
+    device PsaoWords const& psao_cells
 ) {
     metal::uint4 _e3 = psao_cells[index_2];
     return _e3;
@@ -80,17 +83,16 @@ metal::uint4 psao_load_cell(
 
 PsaoGrid psao_grid(
     uint instance_1,
-    device type_2 const& psao_instances,
-    constant _mslBufferSizes& _buffer_sizes
+    device PsaoWords const& psao_instances
 ) {
-    metal::uint4 _e3 = psao_load_instance(instance_1 * 4u, psao_instances, _buffer_sizes);
-    metal::uint4 _e8 = psao_load_instance((instance_1 * 4u) + 1u, psao_instances, _buffer_sizes);
-    metal::uint4 _e13 = psao_load_instance((instance_1 * 4u) + 2u, psao_instances, _buffer_sizes);
-    metal::uint4 _e18 = psao_load_instance((instance_1 * 4u) + 3u, psao_instances, _buffer_sizes);
+    metal::uint4 _e3 = psao_load_instance(instance_1 * 4u, psao_instances);
+    metal::uint4 _e8 = psao_load_instance((instance_1 * 4u) + 1u, psao_instances);
+    metal::uint4 _e13 = psao_load_instance((instance_1 * 4u) + 2u, psao_instances);
+    metal::uint4 _e18 = psao_load_instance((instance_1 * 4u) + 3u, psao_instances);
     return PsaoGrid {as_type<metal::float3>(_e3.xyz), as_type<float>(_e3.w), as_type<metal::float3>(_e8.xyz), _e8.w, _e13.xyz, _e13.w, as_type<metal::float3>(_e18.xyz)};
 }
 
-metal::int3 naga_f2i32(metal::float3 value) {
+metal::int3 psao_naga_f2i32(metal::float3 value) {
     return static_cast<metal::int3>(metal::clamp(value, -2147483600.0, 2147483500.0));
 }
 
@@ -118,7 +120,7 @@ PsaoFragment psao_fragment(
         local_1 = true;
     }
     bool _e65 = local_1;
-    return PsaoFragment {naga_f2i32(lower), g - lower, n * ((squared > 0.0) ? metal::rsqrt(squared) : 0.0), _e65};
+    return PsaoFragment {psao_naga_f2i32(lower), g - lower, n * ((squared > 0.0) ? metal::rsqrt(squared) : 0.0), _e65};
 }
 
 uint psao_weigh(
@@ -130,26 +132,25 @@ uint psao_weigh(
     return (cell.x + ((cell.y * grid_1.dims[0]) * weight_y)) + ((cell.z * (grid_1.dims[0] * grid_1.dims[1])) * weight_z);
 }
 
-uint naga_mod(uint lhs, uint rhs) {
+uint psao_naga_mod(uint lhs, uint rhs) {
     return lhs % metal::select(rhs, 1u, rhs == 0u);
 }
 
 uint psao_find(
     PsaoGrid grid_2,
     metal::uint3 cell_1,
-    device type_2 const& psao_buckets,
-    device type_2 const& psao_cells,
-    constant _mslBufferSizes& _buffer_sizes
+    device PsaoWords const& psao_buckets,
+    device PsaoWords const& psao_cells
 ) {
     uint i = 0u;
     uint _e4 = psao_weigh(grid_2, cell_1, 1u, 1u);
     uint _e8 = psao_weigh(grid_2, cell_1, 17u, 31u);
-    uint bucket = grid_2.bucket_first + naga_mod(_e8, grid_2.bucket_count);
+    uint bucket = grid_2.bucket_first + psao_naga_mod(_e8, grid_2.bucket_count);
     bool loop_init = true;
     while(true) {
         if (!loop_init) {
-            uint _e35 = i;
-            i = _e35 + 1u;
+            uint _e37 = i;
+            i = _e37 + 1u;
         }
         loop_init = false;
         uint _e14 = i;
@@ -159,14 +160,14 @@ uint psao_find(
         }
         {
             uint _e19 = i;
-            metal::uint4 _e23 = psao_load_bucket((bucket * 2u) + (_e19 >> 2u), psao_buckets, _buffer_sizes);
+            metal::uint4 _e23 = psao_load_bucket((bucket * 2u) + (_e19 >> 2u), psao_buckets);
             uint _e24 = i;
-            uint entry = _e23[_e24 & 3u];
+            uint entry = _e23[_e24 & 3u] & PSAO_ENTRY_CELL;
             if (entry == 0u) {
                 break;
             }
-            metal::uint4 _e32 = psao_load_cell(entry * 2u, psao_cells, _buffer_sizes);
-            if (_e32.x == _e4) {
+            metal::uint4 _e34 = psao_load_cell(entry * 2u, psao_cells);
+            if (_e34.x == _e4) {
                 return entry;
             }
         }
@@ -249,10 +250,9 @@ float psao_blend(
     uint instance_2,
     metal::float3 position_2,
     metal::float3 normal_4,
-    device type_2 const& psao_instances,
-    device type_2 const& psao_buckets,
-    device type_2 const& psao_cells,
-    constant _mslBufferSizes& _buffer_sizes
+    device PsaoWords const& psao_instances,
+    device PsaoWords const& psao_buckets,
+    device PsaoWords const& psao_cells
 ) {
     float weights = 0.0;
     float sum = 0.0;
@@ -261,7 +261,7 @@ float psao_blend(
     uint corner = 0u;
     uint i_1 = {};
     float weight = {};
-    PsaoGrid _e4 = psao_grid(instance_2, psao_instances, _buffer_sizes);
+    PsaoGrid _e4 = psao_grid(instance_2, psao_instances);
     PsaoFragment _e5 = psao_fragment(_e4, position_2, normal_4);
     if (_e5.outside) {
         return 1.0;
@@ -283,11 +283,11 @@ float psao_blend(
             uint _e22 = corner;
             uint _e25 = corner;
             metal::uint3 offset = metal::uint3(_e21, _e22 >> 1u, _e25 >> 2u) & metal::uint3(1u);
-            metal::uint3 cell_2 = static_cast<metal::uint3>(_e5.base) + offset;
-            if (metal::any(cell_2 >= _e4.dims)) {
+            metal::uint3 cell_3 = static_cast<metal::uint3>(_e5.base) + offset;
+            if (metal::any(cell_3 >= _e4.dims)) {
                 continue;
             }
-            uint _e38 = psao_find(_e4, cell_2, psao_buckets, psao_cells, _buffer_sizes);
+            uint _e38 = psao_find(_e4, cell_3, psao_buckets, psao_cells);
             if (_e38 == 0u) {
                 continue;
             }
@@ -307,19 +307,19 @@ float psao_blend(
                 }
                 {
                     uint _e51 = i_1;
-                    metal::uint4 _e55 = psao_load_cell((_e38 * 2u) + (_e51 >> 2u), psao_cells, _buffer_sizes);
+                    metal::uint4 _e55 = psao_load_cell((_e38 * 2u) + (_e51 >> 2u), psao_cells);
                     uint _e56 = i_1;
-                    uint point_3 = _e55[_e56 & 3u];
-                    if (point_3 == 0u) {
+                    uint point_4 = _e55[_e56 & 3u];
+                    if (point_4 == 0u) {
                         break;
                     }
-                    if (point_3 < 2147483648u) {
+                    if (point_4 < 2147483648u) {
                         continue;
                     }
-                    metal::float3 _e64 = psao_point_place(point_3);
+                    metal::float3 _e64 = psao_point_place(point_4);
                     metal::float3 d_2 = corner_from + _e64;
-                    metal::float3 _e66 = psao_point_normal(point_3);
-                    float _e67 = psao_point_openness(point_3);
+                    metal::float3 _e66 = psao_point_normal(point_4);
+                    float _e67 = psao_point_openness(point_4);
                     float squared_2 = metal::dot(d_2, d_2);
                     float _e69 = nearest_squared;
                     if (squared_2 < _e69) {
@@ -358,12 +358,11 @@ float psao_planar(
     uint instance_3,
     metal::float3 position_3,
     metal::float3 normal_5,
-    device type_2 const& psao_instances,
-    device type_2 const& psao_buckets,
-    device type_2 const& psao_cells,
-    constant _mslBufferSizes& _buffer_sizes
+    device PsaoWords const& psao_instances,
+    device PsaoWords const& psao_buckets,
+    device PsaoWords const& psao_cells
 ) {
-    float _e4 = psao_blend(true, instance_3, position_3, normal_5, psao_instances, psao_buckets, psao_cells, _buffer_sizes);
+    float _e4 = psao_blend(true, instance_3, position_3, normal_5, psao_instances, psao_buckets, psao_cells);
     return _e4;
 }
 
@@ -371,24 +370,292 @@ float psao_paper(
     uint instance_4,
     metal::float3 position_4,
     metal::float3 normal_6,
-    device type_2 const& psao_instances,
-    device type_2 const& psao_buckets,
-    device type_2 const& psao_cells,
-    constant _mslBufferSizes& _buffer_sizes
+    device PsaoWords const& psao_instances,
+    device PsaoWords const& psao_buckets,
+    device PsaoWords const& psao_cells
 ) {
-    float _e4 = psao_blend(false, instance_4, position_4, normal_6, psao_instances, psao_buckets, psao_cells, _buffer_sizes);
+    float _e4 = psao_blend(false, instance_4, position_4, normal_6, psao_instances, psao_buckets, psao_cells);
     return _e4;
+}
+
+uint psao_tag(
+    uint key
+) {
+    return metal::max((key * 2654435761u) >> 22u, 1u);
+}
+
+uint psao_naga_f2u32(float value) {
+    return static_cast<uint>(metal::clamp(value, 0.0, 4294967000.0));
+}
+
+uint psao_modulo(
+    uint hash,
+    uint count,
+    float inverse
+) {
+    uint left_1 = hash - (psao_naga_f2u32((static_cast<float>(hash) * inverse) * 0.999999) * count);
+    uint rest = left_1 - (psao_naga_f2u32(static_cast<float>(left_1) * inverse) * count);
+    uint raised = (rest >= 2147483648u) ? (rest + count) : rest;
+    return (raised >= count) ? (raised - count) : raised;
+}
+
+void psao_add(
+    thread PsaoSum& total,
+    metal::float2 radius_terms,
+    metal::float3 normal_7,
+    metal::float3 place,
+    uint point_3
+) {
+    metal::int3 steps_1 = static_cast<metal::int3>(metal::uint3(point_3) & metal::uint3(2031616u, 65011712u, 2080374784u));
+    metal::float3 scale = metal::float3(0.00000047683716, 0.000000014901161, 0.0000000004656613);
+    metal::float3 d_3 = (static_cast<metal::float3>(steps_1) * scale) - place;
+    metal::int2 codes_1 = static_cast<metal::int2>(metal::uint2(point_3 >> 8u, point_3 >> 12u) & metal::uint2(15u));
+    metal::float2 uv_1 = static_cast<metal::float2>(metal::min(codes_1, metal::int2(14))) - metal::float2(7.0);
+    float z_1 = (7.0 - metal::abs(uv_1.x)) - metal::abs(uv_1.y);
+    float fold = metal::max(-(z_1), 0.0);
+    metal::float3 m = metal::float3(uv_1 - metal::select(metal::float2(fold), metal::float2(-(fold)), uv_1 < metal::float2(0.0)), z_1);
+    float inverse_1 = 1.0 / metal::dot(m, m);
+    float squared_3 = (point_3 >= 2147483648u) ? metal::dot(d_3, d_3) : PSAO_FAR;
+    float openness = static_cast<float>(static_cast<int>(point_3 & 255u));
+    float _e67 = total.nearest_squared;
+    bool closer = squared_3 < _e67;
+    float _e71 = total.nearest;
+    total.nearest = closer ? openness : _e71;
+    float _e75 = total.nearest_squared;
+    total.nearest_squared = metal::min(_e75, squared_3);
+    float agree_1 = metal::dot(m, normal_7);
+    float agree2_1 = (agree_1 > 0.0) ? ((agree_1 * agree_1) * inverse_1) : 0.0;
+    float along_1 = metal::dot(normal_7, d_3);
+    float point_along = metal::dot(m, d_3);
+    float h2_ = metal::max(along_1 * along_1, (point_along * point_along) * inverse_1);
+    float near_1 = metal::max(1.0 - (squared_3 * radius_terms.x), 0.0);
+    float flatness_1 = metal::max(1.0 - (h2_ * radius_terms.y), 0.0);
+    float agree4_1 = agree2_1 * agree2_1;
+    float weight_1 = ((near_1 * flatness_1) * agree4_1) * agree4_1;
+    float counted = (agree2_1 > 0.010000001) ? weight_1 : 0.0;
+    float _e111 = total.weights;
+    total.weights = _e111 + counted;
+    float _e114 = total.sum;
+    total.sum = _e114 + (counted * openness);
+    return;
+}
+
+PsaoCandidate psao_pick(
+    metal::uint4 entries,
+    uint tag
+) {
+    metal::uint4 tags = entries >> metal::uint4(22u);
+    metal::bool4 may = (tags == metal::uint4(tag)) | (tags == metal::uint4(0u));
+    metal::uint4 cells = (entries & metal::uint4(4194303u)) & (metal::uint4(0u) - static_cast<metal::uint4>(may));
+    uint sum_1 = ((cells.x + cells.y) + cells.z) + cells.w;
+    return PsaoCandidate {sum_1, sum_1 != metal::max(metal::max(cells.x, cells.y), metal::max(cells.z, cells.w))};
+}
+
+PsaoCandidate psao_candidate(
+    PsaoGrid grid_3,
+    float inverse_count,
+    metal::uint3 cell_2,
+    device PsaoWords const& psao_buckets
+) {
+    bool local_4 = {};
+    bool local_5 = {};
+    bool local_6 = {};
+    if (metal::any(cell_2 >= grid_3.dims)) {
+        return PsaoCandidate {0u, false};
+    }
+    uint _e11 = psao_weigh(grid_3, cell_2, 1u, 1u);
+    uint _e12 = psao_tag(_e11);
+    uint _e15 = psao_weigh(grid_3, cell_2, 17u, 31u);
+    uint _e18 = psao_modulo(_e15, grid_3.bucket_count, inverse_count);
+    uint bucket_1 = grid_3.bucket_first + _e18;
+    metal::uint4 _e22 = psao_load_bucket(bucket_1 * 2u, psao_buckets);
+    PsaoCandidate _e23 = psao_pick(_e22, _e12);
+    if (_e22.w == 0u) {
+        return _e23;
+    }
+    metal::uint4 _e31 = psao_load_bucket((bucket_1 * 2u) + 1u, psao_buckets);
+    PsaoCandidate _e32 = psao_pick(_e31, _e12);
+    if (_e23.cell != 0u) {
+        local_4 = _e32.cell != 0u;
+    } else {
+        local_4 = false;
+    }
+    bool both = local_4;
+    if (!(_e23.unsure)) {
+        local_5 = _e32.unsure;
+    } else {
+        local_5 = true;
+    }
+    bool _e52 = local_5;
+    if (!(_e52)) {
+        local_6 = both;
+    } else {
+        local_6 = true;
+    }
+    bool _e57 = local_6;
+    return PsaoCandidate {_e23.cell + _e32.cell, _e57};
 }
 
 float psao_planar_fast(
     uint instance_5,
     metal::float3 position_5,
-    metal::float3 normal_7,
-    device type_2 const& psao_instances,
-    device type_2 const& psao_buckets,
-    device type_2 const& psao_cells,
-    constant _mslBufferSizes& _buffer_sizes
+    metal::float3 normal_8,
+    device PsaoWords const& psao_instances,
+    device PsaoWords const& psao_buckets,
+    device PsaoWords const& psao_cells
 ) {
-    float _e4 = psao_blend(true, instance_5, position_5, normal_7, psao_instances, psao_buckets, psao_cells, _buffer_sizes);
-    return _e4;
+    bool local_7 = {};
+    bool local_8 = {};
+    bool local_9 = {};
+    bool local_10 = {};
+    bool local_11 = {};
+    bool local_12 = {};
+    bool local_13 = {};
+    uint left = {};
+    PsaoSum total_1 = PsaoSum {0.0, 0.0, 255.0, 1000000000000000000000000000000.0};
+    bool second = false;
+    metal::uint4 words = {};
+    bool local_14 = {};
+    bool local_15 = {};
+    bool local_16 = {};
+    PsaoGrid _e3 = psao_grid(instance_5, psao_instances);
+    PsaoFragment _e4 = psao_fragment(_e3, position_5, normal_8);
+    if (_e4.outside) {
+        return 1.0;
+    }
+    float inverse_count_1 = 1.0 / static_cast<float>(_e3.bucket_count);
+    metal::uint3 base = static_cast<metal::uint3>(_e4.base);
+    PsaoCandidate _e13 = psao_candidate(_e3, inverse_count_1, base, psao_buckets);
+    PsaoCandidate _e19 = psao_candidate(_e3, inverse_count_1, base + metal::uint3(1u, 0u, 0u), psao_buckets);
+    PsaoCandidate _e25 = psao_candidate(_e3, inverse_count_1, base + metal::uint3(0u, 1u, 0u), psao_buckets);
+    PsaoCandidate _e31 = psao_candidate(_e3, inverse_count_1, base + metal::uint3(1u, 1u, 0u), psao_buckets);
+    PsaoCandidate _e37 = psao_candidate(_e3, inverse_count_1, base + metal::uint3(0u, 0u, 1u), psao_buckets);
+    PsaoCandidate _e43 = psao_candidate(_e3, inverse_count_1, base + metal::uint3(1u, 0u, 1u), psao_buckets);
+    PsaoCandidate _e49 = psao_candidate(_e3, inverse_count_1, base + metal::uint3(0u, 1u, 1u), psao_buckets);
+    PsaoCandidate _e55 = psao_candidate(_e3, inverse_count_1, base + metal::uint3(1u, 1u, 1u), psao_buckets);
+    if (!(_e13.unsure)) {
+        local_7 = _e19.unsure;
+    } else {
+        local_7 = true;
+    }
+    bool _e62 = local_7;
+    if (!(_e62)) {
+        local_8 = _e25.unsure;
+    } else {
+        local_8 = true;
+    }
+    bool _e68 = local_8;
+    if (!(_e68)) {
+        local_9 = _e31.unsure;
+    } else {
+        local_9 = true;
+    }
+    bool _e74 = local_9;
+    if (!(_e74)) {
+        local_10 = _e37.unsure;
+    } else {
+        local_10 = true;
+    }
+    bool _e80 = local_10;
+    if (!(_e80)) {
+        local_11 = _e43.unsure;
+    } else {
+        local_11 = true;
+    }
+    bool _e86 = local_11;
+    if (!(_e86)) {
+        local_12 = _e49.unsure;
+    } else {
+        local_12 = true;
+    }
+    bool _e92 = local_12;
+    if (!(_e92)) {
+        local_13 = _e55.unsure;
+    } else {
+        local_13 = true;
+    }
+    bool _e98 = local_13;
+    if (_e98) {
+        float _e99 = psao_planar(instance_5, position_5, normal_8, psao_instances, psao_buckets, psao_cells);
+        return _e99;
+    }
+    left = ((((((((_e13.cell != 0u) ? 1u : 0u) | ((_e19.cell != 0u) ? 2u : 0u)) | ((_e25.cell != 0u) ? 4u : 0u)) | ((_e31.cell != 0u) ? 8u : 0u)) | ((_e37.cell != 0u) ? 16u : 0u)) | ((_e43.cell != 0u) ? 32u : 0u)) | ((_e49.cell != 0u) ? 64u : 0u)) | ((_e55.cell != 0u) ? 128u : 0u);
+    float near_term = 1.0 / (_e3.radius * _e3.radius);
+    metal::float2 radius_terms_1 = metal::float2(near_term, near_term / 0.09);
+    while(true) {
+        uint _e172 = left;
+        if (_e172 != 0u) {
+        } else {
+            break;
+        }
+        {
+            uint _e175 = left;
+            uint _e177 = left;
+            uint corner_1 = (as_type<uint>(static_cast<float>(static_cast<int>(_e175 & (0u - _e177)))) >> 23u) - 127u;
+            metal::uint3 offset_1 = metal::uint3(corner_1, corner_1 >> 1u, corner_1 >> 2u) & metal::uint3(1u);
+            bool right = offset_1.x != 0u;
+            bool back = offset_1.y != 0u;
+            uint lower_1 = back ? (right ? _e31.cell : _e25.cell) : (right ? _e19.cell : _e13.cell);
+            uint upper = back ? (right ? _e55.cell : _e49.cell) : (right ? _e43.cell : _e37.cell);
+            uint found = (offset_1.z != 0u) ? upper : lower_1;
+            bool _e223 = second;
+            metal::uint4 _e226 = psao_load_cell((found * 2u) + (_e223 ? 1u : 0u), psao_cells);
+            words = _e226;
+            bool _e228 = second;
+            if (!(_e228)) {
+                uint _e233 = words.x;
+                uint _e237 = psao_weigh(_e3, base + offset_1, 1u, 1u);
+                local_14 = _e233 != _e237;
+            } else {
+                local_14 = false;
+            }
+            bool _e240 = local_14;
+            if (_e240) {
+                words = metal::uint4(0u);
+            }
+            uint _e245 = words.x;
+            bool _e246 = second;
+            uint a = _e246 ? _e245 : 0u;
+            uint _e249 = words.y;
+            bool _e251 = second;
+            if (_e251) {
+                local_15 = a == 0u;
+            } else {
+                local_15 = false;
+            }
+            bool _e257 = local_15;
+            uint b = _e257 ? 0u : _e249;
+            uint _e261 = words.z;
+            uint c = (b != 0u) ? _e261 : 0u;
+            uint _e267 = words.w;
+            uint d_4 = (c != 0u) ? _e267 : 0u;
+            metal::float3 place_1 = (_e4.place - metal::float3(0.015625)) - static_cast<metal::float3>(static_cast<metal::int3>(offset_1));
+            bool _e278 = second;
+            if (_e278) {
+                psao_add(total_1, radius_terms_1, _e4.normal, place_1, a);
+            }
+            psao_add(total_1, radius_terms_1, _e4.normal, place_1, b);
+            psao_add(total_1, radius_terms_1, _e4.normal, place_1, c);
+            psao_add(total_1, radius_terms_1, _e4.normal, place_1, d_4);
+            bool _e283 = second;
+            if (!(_e283)) {
+                local_16 = d_4 != 0u;
+            } else {
+                local_16 = false;
+            }
+            bool _e290 = local_16;
+            second = _e290;
+            uint _e291 = left;
+            uint _e292 = left;
+            uint _e296 = left;
+            bool _e297 = second;
+            left = _e297 ? _e296 : (_e291 & (_e292 - 1u));
+        }
+    }
+    float _e300 = total_1.nearest;
+    float _e302 = total_1.sum;
+    float _e304 = total_1.weights;
+    float _e307 = total_1.weights;
+    float openness_1 = (_e307 > 0.0) ? (_e302 / _e304) : _e300;
+    return metal::min(openness_1 * 0.003921569, 1.0);
 }

@@ -35,16 +35,27 @@ struct PsaoFragment {
     vec3 normal;
     bool outside;
 };
+struct PsaoSum {
+    float weights;
+    float sum;
+    float nearest;
+    float nearest_squared;
+};
+struct PsaoCandidate {
+    uint cell;
+    bool unsure;
+};
 const float PSAO_T_N = 0.1;
 const float PSAO_T_D = 0.7;
 const float PSAO_PLANE_BAND = 0.3;
+const uint PSAO_ENTRY_CELL = 4194303u;
 const float PSAO_FAR = 1e30;
 
-layout(std430, binding = 0) readonly buffer type_2_block_0Fragment { uvec4 psao_instances[]; };
+layout(std430, binding = 0) readonly buffer psao_instances_block { uvec4 psao_instances[]; };
 
-layout(std430, binding = 1) readonly buffer type_2_block_1Fragment { uvec4 psao_buckets[]; };
+layout(std430, binding = 1) readonly buffer psao_buckets_block { uvec4 psao_buckets[]; };
 
-layout(std430, binding = 2) readonly buffer type_2_block_2Fragment { uvec4 psao_cells[]; };
+layout(std430, binding = 2) readonly buffer psao_cells_block { uvec4 psao_cells[]; };
 
 uvec4 psao_load_instance(uint index) {
     uvec4 _e3 = psao_instances[index];
@@ -104,8 +115,8 @@ uint psao_find(PsaoGrid grid_2, uvec3 cell_1) {
     bool loop_init = true;
     while(true) {
         if (!loop_init) {
-            uint _e35 = i;
-            i = (_e35 + 1u);
+            uint _e37 = i;
+            i = (_e37 + 1u);
         }
         loop_init = false;
         uint _e14 = i;
@@ -117,12 +128,12 @@ uint psao_find(PsaoGrid grid_2, uvec3 cell_1) {
             uint _e19 = i;
             uvec4 _e23 = psao_load_bucket(((bucket * 2u) + (_e19 >> 2u)));
             uint _e24 = i;
-            uint entry = _e23[(_e24 & 3u)];
+            uint entry = (_e23[(_e24 & 3u)] & PSAO_ENTRY_CELL);
             if ((entry == 0u)) {
                 break;
             }
-            uvec4 _e32 = psao_load_cell((entry * 2u));
-            if ((_e32.x == _e4)) {
+            uvec4 _e34 = psao_load_cell((entry * 2u));
+            if ((_e34.x == _e4)) {
                 return entry;
             }
         }
@@ -214,11 +225,11 @@ float psao_blend(bool planar, uint instance_2, vec3 position_2, vec3 normal_4) {
             uint _e22 = corner;
             uint _e25 = corner;
             uvec3 offset = (uvec3(_e21, (_e22 >> 1u), (_e25 >> 2u)) & uvec3(1u));
-            uvec3 cell_2 = (uvec3(_e5.base) + offset);
-            if (any(greaterThanEqual(cell_2, _e4.dims))) {
+            uvec3 cell_3 = (uvec3(_e5.base) + offset);
+            if (any(greaterThanEqual(cell_3, _e4.dims))) {
                 continue;
             }
-            uint _e38 = psao_find(_e4, cell_2);
+            uint _e38 = psao_find(_e4, cell_3);
             if ((_e38 == 0u)) {
                 continue;
             }
@@ -240,17 +251,17 @@ float psao_blend(bool planar, uint instance_2, vec3 position_2, vec3 normal_4) {
                     uint _e51 = i_1;
                     uvec4 _e55 = psao_load_cell(((_e38 * 2u) + (_e51 >> 2u)));
                     uint _e56 = i_1;
-                    uint point_3 = _e55[(_e56 & 3u)];
-                    if ((point_3 == 0u)) {
+                    uint point_4 = _e55[(_e56 & 3u)];
+                    if ((point_4 == 0u)) {
                         break;
                     }
-                    if ((point_3 < 2147483648u)) {
+                    if ((point_4 < 2147483648u)) {
                         continue;
                     }
-                    vec3 _e64 = psao_point_place(point_3);
+                    vec3 _e64 = psao_point_place(point_4);
                     vec3 d_2 = (corner_from + _e64);
-                    vec3 _e66 = psao_point_normal(point_3);
-                    float _e67 = psao_point_openness(point_3);
+                    vec3 _e66 = psao_point_normal(point_4);
+                    float _e67 = psao_point_openness(point_4);
                     float squared_2 = dot(d_2, d_2);
                     float _e69 = nearest_squared;
                     if ((squared_2 < _e69)) {
@@ -295,7 +306,253 @@ float psao_paper(uint instance_4, vec3 position_4, vec3 normal_6) {
     return _e4;
 }
 
-float psao_planar_fast(uint instance_5, vec3 position_5, vec3 normal_7) {
-    float _e4 = psao_blend(true, instance_5, position_5, normal_7);
-    return _e4;
+uint psao_tag(uint key) {
+    return max(((key * 2654435761u) >> 22u), 1u);
+}
+
+uint psao_modulo(uint hash, uint count, float inverse_) {
+    uint left_1 = (hash - (uint(((float(hash) * inverse_) * 0.999999)) * count));
+    uint rest = (left_1 - (uint((float(left_1) * inverse_)) * count));
+    uint raised = ((rest >= 2147483648u) ? (rest + count) : rest);
+    return ((raised >= count) ? (raised - count) : raised);
+}
+
+void psao_add(inout PsaoSum total, vec2 radius_terms, vec3 normal_7, vec3 place, uint point_3) {
+    ivec3 steps_1 = ivec3((uvec3(point_3) & uvec3(2031616u, 65011712u, 2080374784u)));
+    vec3 scale = vec3(4.7683716e-7, 1.4901161e-8, 4.656613e-10);
+    vec3 d_3 = ((vec3(steps_1) * scale) - place);
+    ivec2 codes_1 = ivec2((uvec2((point_3 >> 8u), (point_3 >> 12u)) & uvec2(15u)));
+    vec2 uv_1 = (vec2(min(codes_1, ivec2(14))) - vec2(7.0));
+    float z_1 = ((7.0 - abs(uv_1.x)) - abs(uv_1.y));
+    float fold = max(-(z_1), 0.0);
+    vec3 m = vec3((uv_1 - mix(vec2(fold), vec2(-(fold)), lessThan(uv_1, vec2(0.0)))), z_1);
+    float inverse_1 = (1.0 / dot(m, m));
+    float squared_3 = ((point_3 >= 2147483648u) ? dot(d_3, d_3) : PSAO_FAR);
+    float openness = float(int((point_3 & 255u)));
+    float _e67 = total.nearest_squared;
+    bool closer = (squared_3 < _e67);
+    float _e71 = total.nearest;
+    total.nearest = (closer ? openness : _e71);
+    float _e75 = total.nearest_squared;
+    total.nearest_squared = min(_e75, squared_3);
+    float agree_1 = dot(m, normal_7);
+    float agree2_1 = ((agree_1 > 0.0) ? ((agree_1 * agree_1) * inverse_1) : 0.0);
+    float along_1 = dot(normal_7, d_3);
+    float point_along = dot(m, d_3);
+    float h2_ = max((along_1 * along_1), ((point_along * point_along) * inverse_1));
+    float near_1 = max((1.0 - (squared_3 * radius_terms.x)), 0.0);
+    float flatness_1 = max((1.0 - (h2_ * radius_terms.y)), 0.0);
+    float agree4_1 = (agree2_1 * agree2_1);
+    float weight_1 = (((near_1 * flatness_1) * agree4_1) * agree4_1);
+    float counted = ((agree2_1 > 0.010000001) ? weight_1 : 0.0);
+    float _e111 = total.weights;
+    total.weights = (_e111 + counted);
+    float _e114 = total.sum;
+    total.sum = (_e114 + (counted * openness));
+    return;
+}
+
+PsaoCandidate psao_pick(uvec4 entries, uint tag) {
+    uvec4 tags = (entries >> uvec4(22u));
+    bvec4 may = bvec4(equal(tags, uvec4(tag)).x || equal(tags, uvec4(0u)).x, equal(tags, uvec4(tag)).y || equal(tags, uvec4(0u)).y, equal(tags, uvec4(tag)).z || equal(tags, uvec4(0u)).z, equal(tags, uvec4(tag)).w || equal(tags, uvec4(0u)).w);
+    uvec4 cells = ((entries & uvec4(4194303u)) & (uvec4(0u) - uvec4(may)));
+    uint sum_1 = (((cells.x + cells.y) + cells.z) + cells.w);
+    return PsaoCandidate(sum_1, (sum_1 != max(max(cells.x, cells.y), max(cells.z, cells.w))));
+}
+
+PsaoCandidate psao_candidate(PsaoGrid grid_3, float inverse_count, uvec3 cell_2) {
+    bool local_4 = false;
+    bool local_5 = false;
+    bool local_6 = false;
+    if (any(greaterThanEqual(cell_2, grid_3.dims))) {
+        return PsaoCandidate(0u, false);
+    }
+    uint _e11 = psao_weigh(grid_3, cell_2, 1u, 1u);
+    uint _e12 = psao_tag(_e11);
+    uint _e15 = psao_weigh(grid_3, cell_2, 17u, 31u);
+    uint _e18 = psao_modulo(_e15, grid_3.bucket_count, inverse_count);
+    uint bucket_1 = (grid_3.bucket_first + _e18);
+    uvec4 _e22 = psao_load_bucket((bucket_1 * 2u));
+    PsaoCandidate _e23 = psao_pick(_e22, _e12);
+    if ((_e22.w == 0u)) {
+        return _e23;
+    }
+    uvec4 _e31 = psao_load_bucket(((bucket_1 * 2u) + 1u));
+    PsaoCandidate _e32 = psao_pick(_e31, _e12);
+    if ((_e23.cell != 0u)) {
+        local_4 = (_e32.cell != 0u);
+    } else {
+        local_4 = false;
+    }
+    bool both = local_4;
+    if (!(_e23.unsure)) {
+        local_5 = _e32.unsure;
+    } else {
+        local_5 = true;
+    }
+    bool _e52 = local_5;
+    if (!(_e52)) {
+        local_6 = both;
+    } else {
+        local_6 = true;
+    }
+    bool _e57 = local_6;
+    return PsaoCandidate((_e23.cell + _e32.cell), _e57);
+}
+
+float psao_planar_fast(uint instance_5, vec3 position_5, vec3 normal_8) {
+    bool local_7 = false;
+    bool local_8 = false;
+    bool local_9 = false;
+    bool local_10 = false;
+    bool local_11 = false;
+    bool local_12 = false;
+    bool local_13 = false;
+    uint left = 0u;
+    PsaoSum total_1 = PsaoSum(0.0, 0.0, 255.0, 1e30);
+    bool second = false;
+    uvec4 words = uvec4(0u);
+    bool local_14 = false;
+    bool local_15 = false;
+    bool local_16 = false;
+    PsaoGrid _e3 = psao_grid(instance_5);
+    PsaoFragment _e4 = psao_fragment(_e3, position_5, normal_8);
+    if (_e4.outside) {
+        return 1.0;
+    }
+    float inverse_count_1 = (1.0 / float(_e3.bucket_count));
+    uvec3 base = uvec3(_e4.base);
+    PsaoCandidate _e13 = psao_candidate(_e3, inverse_count_1, base);
+    PsaoCandidate _e19 = psao_candidate(_e3, inverse_count_1, (base + uvec3(1u, 0u, 0u)));
+    PsaoCandidate _e25 = psao_candidate(_e3, inverse_count_1, (base + uvec3(0u, 1u, 0u)));
+    PsaoCandidate _e31 = psao_candidate(_e3, inverse_count_1, (base + uvec3(1u, 1u, 0u)));
+    PsaoCandidate _e37 = psao_candidate(_e3, inverse_count_1, (base + uvec3(0u, 0u, 1u)));
+    PsaoCandidate _e43 = psao_candidate(_e3, inverse_count_1, (base + uvec3(1u, 0u, 1u)));
+    PsaoCandidate _e49 = psao_candidate(_e3, inverse_count_1, (base + uvec3(0u, 1u, 1u)));
+    PsaoCandidate _e55 = psao_candidate(_e3, inverse_count_1, (base + uvec3(1u, 1u, 1u)));
+    if (!(_e13.unsure)) {
+        local_7 = _e19.unsure;
+    } else {
+        local_7 = true;
+    }
+    bool _e62 = local_7;
+    if (!(_e62)) {
+        local_8 = _e25.unsure;
+    } else {
+        local_8 = true;
+    }
+    bool _e68 = local_8;
+    if (!(_e68)) {
+        local_9 = _e31.unsure;
+    } else {
+        local_9 = true;
+    }
+    bool _e74 = local_9;
+    if (!(_e74)) {
+        local_10 = _e37.unsure;
+    } else {
+        local_10 = true;
+    }
+    bool _e80 = local_10;
+    if (!(_e80)) {
+        local_11 = _e43.unsure;
+    } else {
+        local_11 = true;
+    }
+    bool _e86 = local_11;
+    if (!(_e86)) {
+        local_12 = _e49.unsure;
+    } else {
+        local_12 = true;
+    }
+    bool _e92 = local_12;
+    if (!(_e92)) {
+        local_13 = _e55.unsure;
+    } else {
+        local_13 = true;
+    }
+    bool _e98 = local_13;
+    if (_e98) {
+        float _e99 = psao_planar(instance_5, position_5, normal_8);
+        return _e99;
+    }
+    left = (((((((((_e13.cell != 0u) ? 1u : 0u) | ((_e19.cell != 0u) ? 2u : 0u)) | ((_e25.cell != 0u) ? 4u : 0u)) | ((_e31.cell != 0u) ? 8u : 0u)) | ((_e37.cell != 0u) ? 16u : 0u)) | ((_e43.cell != 0u) ? 32u : 0u)) | ((_e49.cell != 0u) ? 64u : 0u)) | ((_e55.cell != 0u) ? 128u : 0u));
+    float near_term = (1.0 / (_e3.radius * _e3.radius));
+    vec2 radius_terms_1 = vec2(near_term, (near_term / 0.09));
+    while(true) {
+        uint _e172 = left;
+        if ((_e172 != 0u)) {
+        } else {
+            break;
+        }
+        {
+            uint _e175 = left;
+            uint _e177 = left;
+            uint corner_1 = ((floatBitsToUint(float(int((_e175 & (0u - _e177))))) >> 23u) - 127u);
+            uvec3 offset_1 = (uvec3(corner_1, (corner_1 >> 1u), (corner_1 >> 2u)) & uvec3(1u));
+            bool right = (offset_1.x != 0u);
+            bool back = (offset_1.y != 0u);
+            uint lower_1 = (back ? (right ? _e31.cell : _e25.cell) : (right ? _e19.cell : _e13.cell));
+            uint upper = (back ? (right ? _e55.cell : _e49.cell) : (right ? _e43.cell : _e37.cell));
+            uint found = ((offset_1.z != 0u) ? upper : lower_1);
+            bool _e223 = second;
+            uvec4 _e226 = psao_load_cell(((found * 2u) + (_e223 ? 1u : 0u)));
+            words = _e226;
+            bool _e228 = second;
+            if (!(_e228)) {
+                uint _e233 = words.x;
+                uint _e237 = psao_weigh(_e3, (base + offset_1), 1u, 1u);
+                local_14 = (_e233 != _e237);
+            } else {
+                local_14 = false;
+            }
+            bool _e240 = local_14;
+            if (_e240) {
+                words = uvec4(0u);
+            }
+            uint _e245 = words.x;
+            bool _e246 = second;
+            uint a = (_e246 ? _e245 : 0u);
+            uint _e249 = words.y;
+            bool _e251 = second;
+            if (_e251) {
+                local_15 = (a == 0u);
+            } else {
+                local_15 = false;
+            }
+            bool _e257 = local_15;
+            uint b = (_e257 ? 0u : _e249);
+            uint _e261 = words.z;
+            uint c = ((b != 0u) ? _e261 : 0u);
+            uint _e267 = words.w;
+            uint d_4 = ((c != 0u) ? _e267 : 0u);
+            vec3 place_1 = ((_e4.place - vec3(0.015625)) - vec3(ivec3(offset_1)));
+            bool _e278 = second;
+            if (_e278) {
+                psao_add(total_1, radius_terms_1, _e4.normal, place_1, a);
+            }
+            psao_add(total_1, radius_terms_1, _e4.normal, place_1, b);
+            psao_add(total_1, radius_terms_1, _e4.normal, place_1, c);
+            psao_add(total_1, radius_terms_1, _e4.normal, place_1, d_4);
+            bool _e283 = second;
+            if (!(_e283)) {
+                local_16 = (d_4 != 0u);
+            } else {
+                local_16 = false;
+            }
+            bool _e290 = local_16;
+            second = _e290;
+            uint _e291 = left;
+            uint _e292 = left;
+            uint _e296 = left;
+            bool _e297 = second;
+            left = (_e297 ? _e296 : (_e291 & (_e292 - 1u)));
+        }
+    }
+    float _e300 = total_1.nearest;
+    float _e302 = total_1.sum;
+    float _e304 = total_1.weights;
+    float _e307 = total_1.weights;
+    float openness_1 = ((_e307 > 0.0) ? (_e302 / _e304) : _e300);
+    return min((openness_1 * 0.003921569), 1.0);
 }
