@@ -13,7 +13,7 @@ use psao_server::metrics::Pair;
 use psao_server::rays::Against;
 use psao_server::render::{REFERENCE_RAYS, View};
 use psao_server::samples::Samples;
-use psao_server::scene::{Instance, LocalTransform, Mesh, Node, Scene};
+use psao_server::scene::{Instance, LocalTransform, Mask, Mesh, Node, Scene, Wrap};
 use psao_server::world::{Options, World};
 
 fn gpu() -> Gpu {
@@ -59,8 +59,14 @@ fn the_gbuffer_shows_what_the_processors_rays_see() {
     let camera = camera(&world, width as f32 / height as f32);
     let (_, buffer) = drawn(&gpu, &world, &camera, [width, height]);
 
-    let drawn = buffer.view(&gpu).expect("a device");
-    let cast = View::new(&world, &camera, width as usize, height as usize);
+    compare(&gpu, &world, &camera, &buffer, 5);
+}
+
+/// Holds what is drawn to what the processor's rays see: more than so many instances.
+fn compare(gpu: &Gpu, world: &World, camera: &Camera, buffer: &GBuffer, more_than: usize) {
+    let drawn = buffer.view(gpu).expect("a device");
+    let [width, height] = buffer.size;
+    let cast = View::new(world, camera, width as usize, height as usize);
     let mut instances = std::collections::BTreeSet::new();
     let (mut same, mut near, mut faces_the_same_way) = (0, 0, 0);
     for (drawn, cast) in drawn.fragments.iter().zip(&cast.fragments) {
@@ -85,7 +91,7 @@ fn the_gbuffer_shows_what_the_processors_rays_see() {
         instances.len()
     );
     assert!(
-        instances.len() > 5,
+        instances.len() > more_than,
         "{} instances are not much of a test",
         instances.len()
     );
@@ -244,6 +250,110 @@ fn corner_scene() -> Scene {
     }
 }
 
+/// The corner, and in it two sheets that are seen from both sides and full of holes, one of them
+/// mirrored; and a wall that is seen from its front alone.
+fn holed_scene() -> Scene {
+    let mut scene = corner_scene();
+    let mut sheet = scene.meshes[1].clone();
+    sheet
+        .positions
+        .iter_mut()
+        .for_each(|p| *p = *p * 0.06 + glam::Vec3::Y * 0.1);
+    let mut wall = sheet.clone();
+    wall.triangles = vec![[0, 2, 1], [0, 3, 2]];
+    wall.normals.iter_mut().for_each(|n| *n = -*n);
+    let corners = [[0.0, 0.0], [2.3, 0.4], [2.0, 2.7], [-0.3, 2.0]];
+    sheet.uvs = corners.map(glam::Vec2::from).to_vec();
+    sheet.double_sided = true;
+    sheet.mask = Some(Mask {
+        width: 5,
+        height: 4,
+        alpha: (0..20u32).map(|i| (i * 97 % 256) as u8).collect(),
+        cutoff: 0.5,
+        wrap: [Wrap::Repeat, Wrap::Mirror],
+    });
+    scene.meshes.extend([sheet, wall]);
+    for (mesh, x, z, mirror, moves) in [
+        (2, -1.6, 2.0, 1.0, false),
+        (2, 1.4, 2.5, -1.0, true),
+        (3, 0.0, 4.0, 1.0, false),
+    ] {
+        scene.instances.push(Instance {
+            mesh,
+            node: scene.nodes.len() as u32,
+            moves,
+            ..scene.instances[0].clone()
+        });
+        scene.nodes.push(Node {
+            local: LocalTransform::Trs {
+                translation: glam::DVec3::new(x, 0.0, z),
+                rotation: glam::Quat::from_rotation_y(0.4 * mirror),
+                scale: glam::Vec3::new(mirror, 1.0, 1.0),
+            },
+            ..scene.nodes[0].clone()
+        });
+    }
+    scene
+}
+
+#[test]
+fn holes_and_backs_and_mirrored_surfaces_are_what_they_are_on_the_processor() {
+    let gpu = gpu();
+    let options = Options {
+        density: 0.5,
+        rays: 1,
+        rest_space: true,
+        ..Options::of(psao_core::Kernel::Planar)
+    };
+    let world = World::new(holed_scene(), options, &|_, _, _| ()).expect("a small scene");
+    let camera = Camera {
+        position: glam::Vec3::new(0.0, 1.5, 6.0),
+        forward: glam::Vec3::new(0.0, -0.1, -1.0),
+        up: glam::Vec3::Y,
+        fov_y_rad: 1.0,
+        aspect: 2.0,
+        near: 0.05,
+        far: f32::INFINITY,
+    };
+    let (_, buffer) = drawn(&gpu, &world, &camera, [240, 120]);
+    compare(&gpu, &world, &camera, &buffer, 3);
+
+    let samples = Samples::new(64);
+    let tracer = GpuTracer::new(&gpu, &world.scene, &world.pose, &samples).expect("small");
+    let (mut rays, mut expected) = (Vec::new(), Vec::new());
+    for number in 0..400 {
+        let origin = glam::Vec3::new((number % 20) as f32 * 0.3 - 3.0, 0.4, number as f32 * 0.012);
+        let mut directions = vec![glam::Vec3::ZERO; 64];
+        samples.directions(number, glam::Vec3::Y, glam::Vec3::X, &mut directions);
+        let (mut hit, all) = ([0], Against::All);
+        world
+            .tracer()
+            .occluded(all, origin, &directions, 5.0, &[u64::MAX], &mut hit);
+        expected.extend((0..64).map(|i| hit[0] >> i & 1 == 1));
+        let ray = |&direction| Ray {
+            origin,
+            t_max: 5.0,
+            direction,
+            unused: 0.0,
+        };
+        rays.extend(directions.iter().map(ray));
+    }
+    let found = tracer.occluded(&gpu, &rays).expect("a device");
+    let differ = found.iter().zip(&expected).filter(|(a, b)| a != b).count();
+    let blocked = expected.iter().filter(|hit| **hit).count();
+    println!("of {} rays {blocked} hit, {differ} differ", rays.len());
+    assert!(
+        blocked > 3000 && blocked < rays.len() - 3000,
+        "not much of a test"
+    );
+    // A ray through the edge of a texel may round to either side of it.
+    assert!(
+        differ * 5000 <= rays.len(),
+        "{differ} of {} rays differ",
+        rays.len()
+    );
+}
+
 /// Openness at `distance` from an endless wall at a right angle, by rays of length `radius`: those
 /// that meet the wall are a segment of the disc that the cosine-weighted hemisphere projects to.
 fn beside_a_wall(distance: f32, radius: f32) -> f32 {
@@ -334,11 +444,22 @@ fn the_race_checks_and_times_every_method_and_keeps_its_pictures() {
     assert!(race.exact_off_255 <= 1.0 && race.fast_off_255 <= 4.0);
     assert_eq!(race.rows.len(), 6);
     for row in &race.rows {
-        assert!(row.median_ms > 0.0 && row.p95_ms >= row.median_ms, "{row:?}");
+        assert!(
+            row.median_ms > 0.0 && row.p95_ms >= row.median_ms,
+            "{row:?}"
+        );
         assert!(row.psnr_db > 5.0 && row.psnr_db.is_finite(), "{row:?}");
-        assert!(row.passes.iter().all(|pass| pass.median_ms > 0.0), "{row:?}");
+        assert!(
+            row.passes.iter().all(|pass| pass.median_ms > 0.0),
+            "{row:?}"
+        );
     }
-    let of = |name: &str| race.rows.iter().find(|row| row.method == name).expect("a method");
+    let of = |name: &str| {
+        race.rows
+            .iter()
+            .find(|row| row.method == name)
+            .expect("a method")
+    };
     // Noise, and the same without some of it.
     let noisy = of("1 ray a pixel");
     assert!(of("1 ray a pixel, denoised").psnr_db > noisy.psnr_db + 6.0);

@@ -2,7 +2,6 @@
 // this text stand psao-gpu's lookup functions, with their buffers in bind group 0.
 
 struct Look {
-    eye_forward: vec3<f32>,
     // 0 none, 1 cells, 2 points, 3 dirty heat, 4 occupancy.
     overlay: u32,
     // Pictures so far.
@@ -10,7 +9,6 @@ struct Look {
     // Letters across, and lines.
     columns: u32,
     lines: u32,
-    unused: u32,
 }
 
 @group(1) @binding(0) var<uniform> look: Look;

@@ -141,7 +141,7 @@ fn text(feed: &Feed, pictures: &Pictures, mode: Mode, overlay: Overlay, mbit: f6
         format!("cells      {cells}"),
         match pictures.occlusion_ms {
             Some(ms) => format!("GPU        {ms:.2} ms for occlusion"),
-            None => "GPU        has no clock".into(),
+            None => "GPU        not timed".into(),
         },
     ]
 }

@@ -47,12 +47,10 @@ pub enum Overlay {
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 struct Look {
-    forward: [f32; 3],
     overlay: u32,
     picture: u32,
     columns: u32,
     lines: u32,
-    unused: u32,
 }
 
 /// Letters across and lines of the text.
@@ -329,12 +327,10 @@ impl Pictures {
         gpu.queue
             .write_buffer(&self.text, 256 * 4, bytemuck::cast_slice(&letters));
         let look = Look {
-            forward: shown.camera.forward.into(),
             overlay: shown.overlay as u32,
             picture: self.count,
             columns: TEXT[0] as u32,
             lines: lines as u32,
-            unused: 0,
         };
         gpu.queue
             .write_buffer(&self.look, 0, bytemuck::bytes_of(&look));

@@ -5,6 +5,7 @@ use psao_server::commands::{RecordArgs, ServeArgs, record, serve};
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
+use std::sync::OnceLock;
 
 #[derive(Parser)]
 struct Recorder {
@@ -12,15 +13,18 @@ struct Recorder {
     args: RecordArgs,
 }
 
-/// A short, coarse recording of the built-in scene.
-fn recording(folder: &Path) -> PathBuf {
-    let file = folder.join("atrium.psao");
-    let name = file.to_str().expect("a name in ASCII");
-    let args = "psao --density 24 --rays 32 --frames 3 --path 0"
-        .split(' ')
-        .chain([name]);
-    record(&Recorder::parse_from(args).args, &|_, _, _| ()).expect("a recording");
-    file
+/// A short, coarse recording of the built-in scene, made once.
+fn recording() -> &'static Path {
+    static MADE: OnceLock<PathBuf> = OnceLock::new();
+    MADE.get_or_init(|| {
+        let file = Path::new(env!("CARGO_TARGET_TMPDIR")).join("atrium.psao");
+        let name = file.to_str().expect("a name in UTF-8");
+        let args = "psao --density 24 --rays 32 --frames 3 --path 0"
+            .split(' ')
+            .chain([name]);
+        record(&Recorder::parse_from(args).args, &|_, _, _| ()).expect("a recording");
+        file
+    })
 }
 
 fn viewer() -> Command {
@@ -51,11 +55,10 @@ fn mean_difference(a: &[u8], b: &[u8]) -> f64 {
 #[test]
 fn a_picture_from_the_stream_is_nearer_to_the_ray_traced_one_than_one_without_occlusion() {
     let folder = tempfile::tempdir().expect("a folder");
-    let recording = recording(folder.path());
     let picture = |mode: &str, overlay: &str| {
         let file = folder.path().join(format!("{mode}-{overlay}.png"));
         let out = viewer()
-            .arg(&recording)
+            .arg(recording())
             .args([
                 "--headless",
                 "--size",
@@ -181,8 +184,7 @@ fn what_is_wrong_is_said_with_its_remedy() {
         missing.contains("nothing.psao") && missing.contains("psao record"),
         "{missing}"
     );
-    let recording = recording(folder.path());
-    let recording = recording.to_str().expect("a name in ASCII");
+    let recording = recording().to_str().expect("a name in UTF-8");
     let other = error_of(&[recording, "--movers", "1", "--headless", "--out", out]);
     assert!(other.contains("another scene"), "{other}");
 }
@@ -212,7 +214,6 @@ fn start(command: &mut Command, needs: &str) -> (Running, String) {
 #[test]
 fn a_window_shows_the_scene() {
     let folder = tempfile::tempdir().expect("a folder");
-    let recording = recording(folder.path());
     let (_screen, number) = start(
         Command::new("Xvfb").args(["-displayfd", "1", "-screen", "0", "640x400x24"]),
         "xvfb",
@@ -221,7 +222,7 @@ fn a_window_shows_the_scene() {
     let display = format!(":{number}");
     let (_viewer, said) = start(
         viewer()
-            .arg(&recording)
+            .arg(recording())
             .args(["--size", "480x270"])
             .env("DISPLAY", &display),
         "mesa-vulkan-drivers libxkbcommon-x11-0 libxcursor1 libxi6",

@@ -210,8 +210,7 @@ fn occlusion(@builtin(global_invocation_id) id: vec3<u32>) {
                 let texel = vec2<u32>(sample_at) >> vec2(mip);
                 let most = textureDimensions(distances, mip) - 1u;
                 // What is seen in a mip is seen in the middle of its texel.
-                let middle =
-                    select((vec2<f32>(texel) + 0.5) * f32(1u << mip), floor(sample_at) + 0.5, mip == 0u);
+                let middle = (vec2<f32>(texel) + 0.5) * f32(1u << mip);
                 let there = textureLoad(distances, min(texel, most), mip).x;
                 let front = view_at(middle, extent, there) - here;
                 if dot(front, front) > settings.radius * settings.radius {
