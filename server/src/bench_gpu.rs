@@ -45,7 +45,7 @@ pub struct BenchGpuArgs {
     /// Writes the figures as JSON
     #[arg(long, value_name = "FILE")]
     pub json: Option<PathBuf>,
-    /// Folder for report.html, with the plot, and the pictures as PNG
+    /// Folder for report.html, with the plot, and pictures of the first 4 frames as PNG
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
 }
@@ -59,6 +59,9 @@ const ROUNDS: usize = 15;
 
 /// Passes of the denoiser behind rays: as after the better screen-space method.
 const DENOISE_RAYS: u32 = HIGH.denoise;
+
+/// Frames of which pictures are kept.
+const PICTURES: u32 = 4;
 
 /// Rays a pixel of one call, so that no call takes long.
 const RAYS_A_CALL: u32 = 32;
@@ -306,8 +309,10 @@ pub fn run(args: &BenchGpuArgs, progress: Progress<'_>) -> Result<Race, String> 
             let pair = Pair::new(&reference, &found, &valid, args.size.0, args.size.1)?;
             methods[index].squares += pair.rmse().powi(2) * count;
             methods[index].flip += pair.flip() / f64::from(args.frames);
-            let picture = Picture::grey(&found, &valid, args.size.0, args.size.1);
-            methods[index].panels.push(((*name).into(), picture));
+            if frame < PICTURES {
+                let picture = Picture::grey(&found, &valid, args.size.0, args.size.1);
+                methods[index].panels.push(((*name).into(), picture));
+            }
             match index {
                 0 => fast = found,
                 1 => exact = found,
