@@ -101,6 +101,8 @@ impl Stream {
             density,
             rays,
             rest_space: true,
+            // Where points lie is all the same to a lookup, and this takes minutes less.
+            adaptive: false,
             ..Options::of(Kernel::Planar)
         };
         let world = World::new(scene, options, &|_, _, _| ()).unwrap();
@@ -163,26 +165,27 @@ struct Gpu {
     queue: wgpu::Queue,
 }
 
-static GPU: LazyLock<Gpu> = LazyLock::new(|| {
-    let instance = wgpu::Instance::new(wgpu::InstanceDescriptor {
-        backends: wgpu::Backends::VULKAN,
-        ..wgpu::InstanceDescriptor::new_without_display_handle()
-    });
-    let adapter =
-        pollster::block_on(instance.request_adapter(&wgpu::RequestAdapterOptions::default()))
-            .expect("a Vulkan device: install Debian's mesa-vulkan-drivers, as tests/run does");
-    let required_limits = wgpu::Limits::default();
-    assert_eq!(required_limits.max_storage_buffer_binding_size, 128 << 20);
-    let (device, queue) = pollster::block_on(adapter.request_device(&wgpu::DeviceDescriptor {
-        required_features: wgpu::Features::empty(),
-        required_limits,
-        ..wgpu::DeviceDescriptor::default()
-    }))
-    .unwrap();
-    Gpu { device, queue }
-});
+static GPU: LazyLock<Gpu> = LazyLock::new(|| Gpu::new(wgpu::Features::empty()));
 
 impl Gpu {
+    fn new(required_features: wgpu::Features) -> Gpu {
+        let instance = wgpu::Instance::new(wgpu::InstanceDescriptor {
+            backends: wgpu::Backends::VULKAN,
+            ..wgpu::InstanceDescriptor::new_without_display_handle()
+        });
+        let adapter =
+            pollster::block_on(instance.request_adapter(&wgpu::RequestAdapterOptions::default()))
+                .expect("a Vulkan device: install Debian's mesa-vulkan-drivers, as tests/run does");
+        let required_limits = wgpu::Limits::default();
+        assert_eq!(required_limits.max_storage_buffer_binding_size, 128 << 20);
+        let (device, queue) = pollster::block_on(adapter.request_device(&wgpu::DeviceDescriptor {
+            required_features,
+            required_limits,
+            ..wgpu::DeviceDescriptor::default()
+        }))
+        .unwrap();
+        Gpu { device, queue }
+    }
     fn texture(&self, format: TextureFormat, usage: TextureUsages) -> wgpu::Texture {
         self.device.create_texture(&wgpu::TextureDescriptor {
             label: None,
@@ -253,6 +256,16 @@ impl Gpu {
     fn picture(&self, shot: &Shot, kernel: Kernel, tier: Tier) -> Vec<f32> {
         let buffers = self.buffers(&shot.client);
         let pass = Pass::new(&self.device, &buffers, kernel, tier);
+        self.run_pass(shot, &buffers, &pass, None)
+    }
+
+    fn run_pass(
+        &self,
+        shot: &Shot,
+        buffers: &Buffers,
+        pass: &Pass,
+        timestamp_writes: Option<wgpu::ComputePassTimestampWrites<'_>>,
+    ) -> Vec<f32> {
         let [positions, normals] = shot.g_buffer();
         let positions = self.filled(TextureFormat::Rgba32Uint, &positions);
         let normals = self.filled(TextureFormat::Rgba32Float, &normals);
@@ -262,8 +275,11 @@ impl Gpu {
         let g_buffer = pass.g_buffer(&self.device, &positions, &normals, &view);
         let mut encoder = self.encoder();
         {
-            let mut run = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
-            pass.encode(&mut run, &buffers, &g_buffer);
+            let mut run = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor {
+                label: None,
+                timestamp_writes,
+            });
+            pass.encode(&mut run, buffers, &g_buffer);
         }
         self.submit(encoder);
         self.read_texture(&openness)
@@ -324,7 +340,7 @@ fn assert_exact(shot: &Shot, what: &str, got: &[f32], kernel: Kernel) {
     let [one, _, largest] = compare(shot, got, &expected);
     assert!(
         one == 0.0,
-        "{}, {what}, {kernel:?}: {one} of the pixels are off by more than 1/255, by up to {largest}",
+        "{}, {what}, {kernel:?}: {one} of the pixels are off by more than 1/255, up to {largest}",
         shot.name
     );
 }
@@ -350,6 +366,61 @@ fn fast_is_exact_to_the_eye() {
              worst by {largest}",
             shot.name
         );
+    }
+}
+
+/// Prints what both tiers take, and the lookup of the paper; see docs/gpu.md.
+#[test]
+fn fast_takes_fewer_milliseconds_than_exact() {
+    let gpu = Gpu::new(wgpu::Features::TIMESTAMP_QUERY);
+    let set = gpu.device.create_query_set(&wgpu::QuerySetDescriptor {
+        label: None,
+        ty: wgpu::QueryType::Timestamp,
+        count: 2,
+    });
+    let resolved = gpu.device.create_buffer(&wgpu::BufferDescriptor {
+        label: None,
+        size: 16,
+        usage: wgpu::BufferUsages::QUERY_RESOLVE | wgpu::BufferUsages::COPY_SRC,
+        mapped_at_creation: false,
+    });
+    for shot in shots() {
+        let buffers = gpu.buffers(&shot.client);
+        let passes = [
+            (Kernel::Planar, Tier::Exact),
+            (Kernel::Planar, Tier::Fast),
+            (Kernel::Paper, Tier::Exact),
+        ]
+        .map(|(kernel, tier)| Pass::new(&gpu.device, &buffers, kernel, tier));
+        let mut ms = [const { Vec::new() }; 3];
+        // In turn, so that what else runs on the machine slows all of them.
+        for _ in 0..7 {
+            for (pass, ms) in passes.iter().zip(&mut ms) {
+                let writes = wgpu::ComputePassTimestampWrites {
+                    query_set: &set,
+                    beginning_of_pass_write_index: Some(0),
+                    end_of_pass_write_index: Some(1),
+                };
+                gpu.run_pass(shot, &buffers, pass, Some(writes));
+                let mut encoder = gpu.encoder();
+                encoder.resolve_query_set(&set, 0..2, &resolved, 0);
+                gpu.submit(encoder);
+                let ticks: Vec<u64> = bytemuck::pod_collect_to_vec(&gpu.read(&resolved));
+                let period_ns = gpu.queue.get_timestamp_period();
+                ms.push((ticks[1] - ticks[0]) as f32 * period_ns / 1e6);
+            }
+        }
+        let [exact, fast, paper] = ms.map(|mut ms| {
+            ms.sort_by(f32::total_cmp);
+            ms[ms.len() / 2]
+        });
+        println!(
+            "{}, {WIDTH}x{HEIGHT}: planar exact {exact:.1} ms, fast {fast:.1} ms ({:.2} times \
+             fewer), paper exact {paper:.1} ms",
+            shot.name,
+            exact / fast
+        );
+        assert!(fast < 0.8 * exact, "fast takes {fast} ms, exact {exact} ms");
     }
 }
 

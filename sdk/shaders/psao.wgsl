@@ -20,16 +20,23 @@
 //     fn psao_load_cell(index: u32) -> vec4<u32>
 // Nothing else: no bindings, no derivatives, no texture filters, no subgroups. Any stage will do.
 
-// Points whose normal differs more than this from the fragment's (as a dot product) do not count.
+// Points whose normal differs more than this from the fragment's (as a dot product) do not count;
+// for `planar` they count as if it were this much.
 const PSAO_T_N: f32 = 0.1;
 // `paper`: points that lie this much above or below their own plane do not count.
 const PSAO_T_D: f32 = 0.7;
-// `planar`: half-width of the band around the plane, in radii.
-const PSAO_PLANE_BAND: f32 = 0.3;
+// `planar`: squared distances from the planes count this much more than those along them.
+const PSAO_FLATNESS: f32 = 11.0;
+// `planar`: the squared distance, in radii, from which weights begin to fall.
+const PSAO_CORE: f32 = 0.2;
+// `planar`: how far before the block switches the cells fade that it will leave, in cells.
+const PSAO_FADE: f32 = 0.3;
+// `planar`: points less open than this count less, in proportion.
+const PSAO_SEEN: f32 = 0.2;
+// `planar`: what a point counts at least, however dark.
+const PSAO_UNSEEN: f32 = 0.001;
 // A bucket's entry: the cell's index, and above it a tag of its key (psao_tag) or 0 for none.
 const PSAO_ENTRY_CELL: u32 = 0x3fffffu;
-// Larger than any distance in a block of cells.
-const PSAO_FAR: f32 = 1e30;
 
 // An instance's grid and hash table: the 64 bytes of an instance.
 struct PsaoGrid {
@@ -142,24 +149,27 @@ fn psao_paper_weight(radius: f32, normal: vec3<f32>, d: vec3<f32>, point_normal:
     return max((radius - sqrt(squared)) / radius, 0.0);
 }
 
-// Weight of a point at `d` from the fragment: nearness, flatness and agreement of the normals.
+// Weight of a point at `d` from the fragment.
 fn psao_planar_weight(
     radius: f32,
     normal: vec3<f32>,
     d: vec3<f32>,
     point_normal: vec3<f32>,
 ) -> f32 {
-    let agree = dot(point_normal, normal);
-    if agree <= PSAO_T_N {
-        return 0.0;
-    }
+    let agree = max(dot(point_normal, normal), PSAO_T_N);
     let h = max(abs(dot(normal, d)), abs(dot(point_normal, d)));
-    let band = PSAO_PLANE_BAND * radius;
-    let near = max(1.0 - dot(d, d) / (radius * radius), 0.0);
-    let flatness = max(1.0 - h * h / (band * band), 0.0);
+    let apart = PSAO_CORE + (dot(d, d) + PSAO_FLATNESS * (h * h)) / (radius * radius);
     let agree2 = agree * agree;
     let agree4 = agree2 * agree2;
-    return near * flatness * agree4 * agree4;
+    return agree4 * agree4 / (apart * apart);
+}
+
+// How much the lower and the upper cells of a block count along the axes, for a fragment at this
+// place in it: nothing once the block is about to leave them.
+fn psao_side(place: vec3<f32>, offset: vec3<u32>) -> f32 {
+    let left = select(1.5 - place, place - 0.5, offset != vec3<u32>(0u));
+    let sides = clamp(left / PSAO_FADE, vec3<f32>(0.0), vec3<f32>(1.0));
+    return sides.x * sides.y * sides.z;
 }
 
 // The blend, written plainly: each of the 8 cells is found, each of its points weighed.
@@ -171,8 +181,6 @@ fn psao_blend(planar: bool, instance: u32, position: vec3<f32>, normal: vec3<f32
     }
     var weights = 0.0;
     var sum = 0.0;
-    var nearest = 1.0;
-    var nearest_squared = PSAO_FAR;
     for (var corner = 0u; corner < 8u; corner += 1u) {
         let offset = vec3<u32>(corner, corner >> 1u, corner >> 2u) & vec3<u32>(1u);
         // −1 becomes a large number: below the grid is out of range too.
@@ -185,6 +193,7 @@ fn psao_blend(planar: bool, instance: u32, position: vec3<f32>, normal: vec3<f32
             continue;
         }
         let corner_from = vec3<f32>(offset) - fragment.place;
+        let side = psao_side(fragment.place, offset);
         for (var i = 1u; i < 8u; i += 1u) {
             let point = psao_load_cell(found * 2u + (i >> 2u))[i & 3u];
             if point == 0u {
@@ -196,14 +205,11 @@ fn psao_blend(planar: bool, instance: u32, position: vec3<f32>, normal: vec3<f32
             let d = corner_from + psao_point_place(point);
             let point_normal = psao_point_normal(point);
             let openness = psao_point_openness(point);
-            let squared = dot(d, d);
-            if squared < nearest_squared {
-                nearest_squared = squared;
-                nearest = openness;
-            }
             var weight = 0.0;
             if planar {
-                weight = psao_planar_weight(grid.radius, fragment.normal, d, point_normal);
+                let seen = min(openness / PSAO_SEEN, 1.0) + PSAO_UNSEEN;
+                weight = side * seen
+                    * psao_planar_weight(grid.radius, fragment.normal, d, point_normal);
             } else {
                 weight = psao_paper_weight(grid.radius, fragment.normal, d, point_normal);
             }
@@ -214,11 +220,11 @@ fn psao_blend(planar: bool, instance: u32, position: vec3<f32>, normal: vec3<f32
     if weights > 0.0 {
         return min(sum / weights, 1.0);
     }
-    return select(1.0, nearest, planar);
+    return 1.0;
 }
 
-// (1 − d²/r²) · max(0, 1 − (h/0.3r)²) · max(0, n·nₚ)⁸ with h = max(|n·d|, |nₚ·d|); where no point
-// counts, the nearest one.
+// s · (min(1, 5o) + 0.001) · max(0.1, n·nₚ)⁸ / (0.2 + (d² + 11h²)/r²)² with
+// h = max(|n·d|, |nₚ·d|), o the point's openness and s its cell's part; open where no point is.
 fn psao_planar(instance: u32, position: vec3<f32>, normal: vec3<f32>) -> f32 {
     return psao_blend(true, instance, position, normal);
 }
@@ -247,22 +253,15 @@ fn psao_modulo(hash: u32, count: u32, inverse: f32) -> u32 {
     return select(raised, raised - count, raised >= count);
 }
 
-// A blend that is being made.
-struct PsaoSum {
-    weights: f32,
-    sum: f32,
-    // In 1/255, as sum.
-    nearest: f32,
-    nearest_squared: f32,
-}
-
-// Adds a word of a cell; `place` is the fragment's in the cell, half a step less. Signed integers
-// become floats in one step everywhere, unsigned ones do not.
+// A blend that is being made: the sum of the weights, and of the weighted openness in 1/255.
+// `place` is the fragment's in the cell, half a step less; `side` the cell's part. What is no point
+// adds nothing. Signed integers become floats in one step everywhere, unsigned ones do not.
 fn psao_add(
-    total: ptr<function, PsaoSum>,
-    radius_terms: vec2<f32>,
+    sums: ptr<function, vec2<f32>>,
+    inverse_radius2: f32,
     normal: vec3<f32>,
     place: vec3<f32>,
+    side: f32,
     point: u32,
 ) {
     let steps = vec3<i32>(vec3<u32>(point) & vec3<u32>(0x1f0000u, 0x3e00000u, 0x7c000000u));
@@ -275,24 +274,17 @@ fn psao_add(
     // The point's normal, of any length: what is squared below is divided by its square.
     let m = vec3<f32>(uv - select(vec2<f32>(fold), vec2<f32>(-fold), uv < vec2<f32>(0.0)), z);
     let inverse = 1.0 / dot(m, m);
-    // What is no point is far away.
-    let squared = select(PSAO_FAR, dot(d, d), point >= 0x80000000u);
-    let openness = f32(i32(point & 255u));
-    let closer = squared < (*total).nearest_squared;
-    (*total).nearest = select((*total).nearest, openness, closer);
-    (*total).nearest_squared = min((*total).nearest_squared, squared);
-    let agree = dot(m, normal);
-    let agree2 = select(0.0, agree * agree * inverse, agree > 0.0);
+    let agree = max(dot(m, normal), 0.0);
+    let agree2 = max(agree * agree * inverse, PSAO_T_N * PSAO_T_N);
     let along = dot(normal, d);
     let point_along = dot(m, d);
     let h2 = max(along * along, point_along * point_along * inverse);
-    let near = max(1.0 - squared * radius_terms.x, 0.0);
-    let flatness = max(1.0 - h2 * radius_terms.y, 0.0);
+    let apart = PSAO_CORE + (dot(d, d) + PSAO_FLATNESS * h2) * inverse_radius2;
+    let openness = f32(i32(point & 255u));
+    let seen = min(openness * (1.0 / (255.0 * PSAO_SEEN)), 1.0) + PSAO_UNSEEN;
     let agree4 = agree2 * agree2;
-    let weight = near * flatness * agree4 * agree4;
-    let counted = select(0.0, weight, agree2 > PSAO_T_N * PSAO_T_N);
-    (*total).weights += counted;
-    (*total).sum += counted * openness;
+    let weight = side * seen * agree4 * agree4 / (apart * apart);
+    *sums += select(0.0, weight, point >= 0x80000000u) * vec2<f32>(1.0, openness);
 }
 
 // What one corner of a block may be.
@@ -357,9 +349,8 @@ fn psao_planar_fast(instance: u32, position: vec3<f32>, normal: vec3<f32>) -> f3
         | select(0u, 4u, may_be_c.cell != 0u) | select(0u, 8u, may_be_d.cell != 0u)
         | select(0u, 16u, may_be_e.cell != 0u) | select(0u, 32u, may_be_f.cell != 0u)
         | select(0u, 64u, may_be_g.cell != 0u) | select(0u, 128u, may_be_h.cell != 0u);
-    let near_term = 1.0 / (grid.radius * grid.radius);
-    let radius_terms = vec2<f32>(near_term, near_term / (PSAO_PLANE_BAND * PSAO_PLANE_BAND));
-    var total = PsaoSum(0.0, 0.0, 255.0, PSAO_FAR);
+    let inverse_radius2 = 1.0 / (grid.radius * grid.radius);
+    var sums = vec2<f32>(0.0);
     // A round takes half a cell, without branches: the first three points, then the other four.
     var second = false;
     while left != 0u {
@@ -389,16 +380,16 @@ fn psao_planar_fast(instance: u32, position: vec3<f32>, normal: vec3<f32>) -> f3
         let b = select(words.y, 0u, second && a == 0u);
         let c = select(0u, words.z, b != 0u);
         let d = select(0u, words.w, c != 0u);
+        let side = psao_side(fragment.place, offset);
         let place = fragment.place - 0.015625 - vec3<f32>(vec3<i32>(offset));
         if second {
-            psao_add(&total, radius_terms, fragment.normal, place, a);
+            psao_add(&sums, inverse_radius2, fragment.normal, place, side, a);
         }
-        psao_add(&total, radius_terms, fragment.normal, place, b);
-        psao_add(&total, radius_terms, fragment.normal, place, c);
-        psao_add(&total, radius_terms, fragment.normal, place, d);
+        psao_add(&sums, inverse_radius2, fragment.normal, place, side, b);
+        psao_add(&sums, inverse_radius2, fragment.normal, place, side, c);
+        psao_add(&sums, inverse_radius2, fragment.normal, place, side, d);
         second = !second && d != 0u;
         left = select(left & (left - 1u), left, second);
     }
-    let openness = select(total.nearest, total.sum / total.weights, total.weights > 0.0);
-    return min(openness * (1.0 / 255.0), 1.0);
+    return select(1.0, min(sums.y / sums.x * (1.0 / 255.0), 1.0), sums.x > 0.0);
 }

@@ -31,6 +31,7 @@ const HEADER: &str = "\
 //     float psao_planar_fast(uint instance, vec3 position, vec3 normal)   planar, the quicker way
 //     float psao_planar(uint instance, vec3 position, vec3 normal)        planar, written plainly
 //     float psao_paper(uint instance, vec3 position, vec3 normal)
+// The first is quicker only if the buckets have tags: docs/gpu.md says how to put them there.
 // instance: index into the instance buffer, below its capacity.
 // position: in the instance's local space (rest space where it is skinned or morphed). It must come
 //     from the vertices' own positions, as a varying. Never subtract it from a world position: f32
@@ -58,8 +59,8 @@ pub fn generate(root: &Path) -> Result<Vec<(&'static str, String)>, String> {
             storage.glsl(
                 310,
                 "\
-// GLSL ES 3.10 and Vulkan's GLSL (4.50). Reads storage buffers: bind the client's instances, buckets
-// and cells, as they are, to the bindings below. The fragment stage needs three of them
+// GLSL ES 3.10 and Vulkan's GLSL (4.50). Reads storage buffers: bind the client's instances,
+// buckets and cells, as they are, to the bindings below. The fragment stage needs three of them
 // (GL_MAX_FRAGMENT_SHADER_STORAGE_BLOCKS); where there are fewer, use psao_es300.glsl.
 ",
             )?,
@@ -72,7 +73,8 @@ pub fn generate(root: &Path) -> Result<Vec<(&'static str, String)>, String> {
 // GLSL ES 3.00. Reads textures of format GL_RGBA32UI, 2048 texels wide, filters GL_NEAREST, one
 // level: bind the client's instances, buckets and cells to the samplers below. Each holds its
 // buffer's bytes, 16 a texel, row after row; the last row is padded. Upload what changed with
-// glTexSubImage2D (GL_RGBA_INTEGER, GL_UNSIGNED_INT): an instance is 4 texels, a bucket or a cell 2.
+// glTexSubImage2D (GL_RGBA_INTEGER, GL_UNSIGNED_INT): an instance is 4 texels, a bucket or a cell
+// 2. A texture that has to be taller than GL_MAX_TEXTURE_SIZE is too much for this device.
 ",
             )?,
         ),

@@ -22,6 +22,8 @@ pub struct Buffers {
     capacity: Capacity,
     belt: StagingBelt,
     tags: Tags,
+    /// What the present upload copies.
+    plan: Vec<(Buffer, Range<u32>)>,
 }
 
 /// What the buckets on the GPU say of the cells.
@@ -29,8 +31,8 @@ pub struct Buffers {
 struct Tags {
     /// The bucket that names a cell, and the tag that it has there; 0 for none.
     of_cells: Vec<(u32, u16)>,
-    /// Buckets of a run, with tags.
-    run: Vec<Bucket>,
+    /// Some buckets of a run, with tags.
+    run: [Bucket; 64],
 }
 
 /// A buffer is larger than the device can bind, or than entries of buckets can name.
@@ -80,7 +82,7 @@ const STRIDES: [u64; 3] = [
     size_of::<Cell>() as u64,
 ];
 
-/// Staging memory is taken in pieces of this size, enough for most frames.
+/// Least staging memory that is taken at a time, enough for most frames.
 const CHUNK_BYTES: u64 = 256 << 10;
 
 /// After an upload larger than this (the first frame's, a snapshot's) its staging memory is given
@@ -148,8 +150,9 @@ impl Buffers {
             belt: StagingBelt::new(device.clone(), CHUNK_BYTES),
             tags: Tags {
                 of_cells: vec![(0, 0); capacity.cells as usize],
-                run: vec![Bucket::default(); CHUNK_BYTES as usize / size_of::<Bucket>()],
+                run: [Bucket::default(); 64],
             },
+            plan: Vec::new(),
             device: device.clone(),
             buffers,
             layout,
@@ -175,50 +178,38 @@ impl Buffers {
             self.capacity.holds(&mirror.capacity()),
             "the mirror is larger than the buffers made for it"
         );
-        let mut done = Uploaded::default();
-        for kind in KINDS {
-            let mut pending: Option<Range<u32>> = None;
-            for run in mirror.dirty_runs(kind) {
-                let stride = STRIDES[kind as usize];
-                let bytes = |range: Range<u32>| u64::from(range.end - range.start) * stride;
-                done.dirty_bytes += bytes(run.clone());
-                pending = match pending {
-                    Some(before) if done.affords(bytes(before.end..run.end)) => {
-                        done.bytes += bytes(before.end..run.end);
-                        Some(before.start..run.end)
-                    }
-                    before => {
-                        done.bytes += bytes(run.clone());
-                        if let Some(before) = before {
-                            self.copy(encoder, kind, mirror, before, &mut done);
-                        }
-                        Some(run)
-                    }
-                };
+        let done = self.make_plan(mirror);
+        let Some(size) = wgpu::BufferSize::new(done.bytes) else {
+            return done;
+        };
+        // One piece of staging memory for all: taking one costs more than copying a range.
+        let align = const { wgpu::BufferSize::new(wgpu::COPY_BUFFER_ALIGNMENT).unwrap() };
+        let staging = self.belt.allocate(size, align);
+        let mut view = staging
+            .get_mapped_range_mut()
+            .expect("the belt lends memory that is mapped");
+        let mut filled = 0;
+        let mut fill = |bytes: &[u8]| {
+            view.slice(filled..filled + bytes.len())
+                .copy_from_slice(bytes);
+            filled += bytes.len();
+        };
+        let mut offset = staging.offset();
+        for (kind, run) in &self.plan {
+            let elements = run.start as usize..run.end as usize;
+            match kind {
+                Buffer::Instances => fill(bytemuck::cast_slice(&mirror.instances()[elements])),
+                Buffer::Buckets => self.tags.tag(mirror, elements, &mut fill),
+                Buffer::Cells => fill(bytemuck::cast_slice(&mirror.cells()[elements])),
             }
-            if let Some(last) = pending {
-                self.copy(encoder, kind, mirror, last, &mut done);
-            }
+            let stride = STRIDES[*kind as usize];
+            let bytes = bytes_of(*kind, run);
+            let target = &self.buffers[*kind as usize];
+            let at = u64::from(run.start) * stride;
+            encoder.copy_buffer_to_buffer(staging.buffer(), offset, target, at, bytes);
+            offset += bytes;
         }
-        // A cell may have got another key in the same entry of the same bucket.
-        for index in mirror.dirty_runs(Buffer::Cells).flatten() {
-            let (bucket, tag) = self.tags.of_cells[index as usize];
-            let named = |bucket: &Bucket| bucket.cells().any(|entry| entry == index);
-            if tag != 0
-                && tag != tag_of(mirror.cells()[index as usize].key)
-                && mirror.buckets().get(bucket as usize).is_some_and(named)
-            {
-                done.dirty_bytes += size_of::<Bucket>() as u64;
-                done.bytes += size_of::<Bucket>() as u64;
-                self.copy(
-                    encoder,
-                    Buffer::Buckets,
-                    mirror,
-                    bucket..bucket + 1,
-                    &mut done,
-                );
-            }
-        }
+        drop(view);
         self.belt.finish_and_recall_on_submit(encoder);
         if done.bytes > KEPT_BYTES {
             self.belt = StagingBelt::new(self.device.clone(), CHUNK_BYTES);
@@ -226,38 +217,47 @@ impl Buffers {
         done
     }
 
-    fn copy<M: Memory>(
-        &mut self,
-        encoder: &mut wgpu::CommandEncoder,
-        kind: Buffer,
-        mirror: &Mirror<M>,
-        range: Range<u32>,
-        done: &mut Uploaded,
-    ) {
-        let stride = STRIDES[kind as usize];
-        let at_once = CHUNK_BYTES / stride;
-        for start in range.clone().step_by(at_once as usize) {
-            let (start, end) = (
-                start as usize,
-                range.end.min(start + at_once as u32) as usize,
-            );
-            let bytes: &[u8] = match kind {
-                Buffer::Instances => bytemuck::cast_slice(&mirror.instances()[start..end]),
-                Buffer::Buckets => {
-                    let tagged =
-                        self.tags
-                            .tag(mirror.cells(), &mirror.buckets()[start..end], start);
-                    bytemuck::cast_slice(tagged)
+    /// What has to be copied: what changed, and little of what lies between.
+    fn make_plan<M: Memory>(&mut self, mirror: &Mirror<M>) -> Uploaded {
+        let mut done = Uploaded::default();
+        self.plan.clear();
+        for kind in KINDS {
+            let first = self.plan.len();
+            for run in mirror.dirty_runs(kind) {
+                done.dirty_bytes += bytes_of(kind, &run);
+                if let Some((_, before)) = self.plan[first..].last_mut() {
+                    let more = bytes_of(kind, &(before.end..run.end));
+                    if done.affords(more) {
+                        done.bytes += more;
+                        before.end = run.end;
+                        continue;
+                    }
                 }
-                Buffer::Cells => bytemuck::cast_slice(&mirror.cells()[start..end]),
-            };
-            let size = wgpu::BufferSize::new(bytes.len() as u64).expect("a run is not empty");
-            let offset = start as u64 * stride;
-            self.belt
-                .write_buffer(encoder, &self.buffers[kind as usize], offset, size)
-                .copy_from_slice(bytes);
-            done.copies += 1;
+                done.bytes += bytes_of(kind, &run);
+                self.plan.push((kind, run));
+            }
         }
+        // A cell may have another key in the same entry of the same bucket: that has an old tag.
+        for index in mirror.dirty_runs(Buffer::Cells).flatten() {
+            let (bucket, tag) = self.tags.of_cells[index as usize];
+            let named = |bucket: &Bucket| bucket.cells().any(|entry| entry == index);
+            let planned = || {
+                let next = mirror.next_dirty(Buffer::Buckets, bucket);
+                next.is_some_and(|run| run.start == bucket)
+            };
+            if tag != 0
+                && tag != tag_of(mirror.cells()[index as usize].key)
+                && mirror.buckets().get(bucket as usize).is_some_and(named)
+                && !planned()
+            {
+                let run = bucket..bucket + 1;
+                done.dirty_bytes += bytes_of(Buffer::Buckets, &run);
+                done.bytes += bytes_of(Buffer::Buckets, &run);
+                self.plan.push((Buffer::Buckets, run));
+            }
+        }
+        done.copies = self.plan.len() as u32;
+        done
     }
 
     /// Layout of [`Buffers::bind_group`]: read-only storage buffers at bindings 0 (instances),
@@ -279,21 +279,32 @@ impl Buffers {
 }
 
 impl Tags {
-    /// The buckets of a run that begins at `first`, each entry with its cell's tag, no longer than
-    /// a chunk.
-    fn tag(&mut self, cells: &[Cell], buckets: &[Bucket], first: usize) -> &[Bucket] {
-        let tagged = &mut self.run[..buckets.len()];
-        for (at, (tagged, bucket)) in tagged.iter_mut().zip(buckets).enumerate() {
-            *tagged = *bucket;
-            for entry in tagged.entries.iter_mut().take_while(|entry| **entry != 0) {
-                // A mirror's buckets name only cells that it has.
-                let tag = tag_of(cells[*entry as usize].key);
-                self.of_cells[*entry as usize] = ((first + at) as u32, tag);
-                *entry |= u32::from(tag) << INDEX_BITS;
+    /// Puts out the buckets of a run, each entry with its cell's tag.
+    fn tag<M: Memory>(
+        &mut self,
+        mirror: &Mirror<M>,
+        run: Range<usize>,
+        mut out: impl FnMut(&[u8]),
+    ) {
+        for first in run.clone().step_by(self.run.len()) {
+            let buckets = &mirror.buckets()[first..run.end.min(first + self.run.len())];
+            let tagged = &mut self.run[..buckets.len()];
+            tagged.copy_from_slice(buckets);
+            for (index, bucket) in (first as u32..).zip(&mut *tagged) {
+                for entry in bucket.entries.iter_mut().take_while(|entry| **entry != 0) {
+                    // A mirror's buckets name only cells that it has.
+                    let tag = tag_of(mirror.cells()[*entry as usize].key);
+                    self.of_cells[*entry as usize] = (index, tag);
+                    *entry |= u32::from(tag) << INDEX_BITS;
+                }
             }
+            out(bytemuck::cast_slice(tagged));
         }
-        tagged
     }
+}
+
+fn bytes_of(kind: Buffer, run: &Range<u32>) -> u64 {
+    u64::from(run.end - run.start) * STRIDES[kind as usize]
 }
 
 /// `psao_tag` of psao.wgsl.

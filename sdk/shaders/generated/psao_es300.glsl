@@ -6,6 +6,7 @@
 //     float psao_planar_fast(uint instance, vec3 position, vec3 normal)   planar, the quicker way
 //     float psao_planar(uint instance, vec3 position, vec3 normal)        planar, written plainly
 //     float psao_paper(uint instance, vec3 position, vec3 normal)
+// The first is quicker only if the buckets have tags: docs/gpu.md says how to put them there.
 // instance: index into the instance buffer, below its capacity.
 // position: in the instance's local space (rest space where it is skinned or morphed). It must come
 //     from the vertices' own positions, as a varying. Never subtract it from a world position: f32
@@ -16,7 +17,8 @@
 // GLSL ES 3.00. Reads textures of format GL_RGBA32UI, 2048 texels wide, filters GL_NEAREST, one
 // level: bind the client's instances, buckets and cells to the samplers below. Each holds its
 // buffer's bytes, 16 a texel, row after row; the last row is padded. Upload what changed with
-// glTexSubImage2D (GL_RGBA_INTEGER, GL_UNSIGNED_INT): an instance is 4 texels, a bucket or a cell 2.
+// glTexSubImage2D (GL_RGBA_INTEGER, GL_UNSIGNED_INT): an instance is 4 texels, a bucket or a cell
+// 2. A texture that has to be taller than GL_MAX_TEXTURE_SIZE is too much for this device.
 
 precision highp float;
 precision highp int;
@@ -36,21 +38,18 @@ struct PsaoFragment {
     vec3 normal;
     bool outside;
 };
-struct PsaoSum {
-    float weights;
-    float sum;
-    float nearest;
-    float nearest_squared;
-};
 struct PsaoCandidate {
     uint cell;
     bool unsure;
 };
 const float PSAO_T_N = 0.1;
 const float PSAO_T_D = 0.7;
-const float PSAO_PLANE_BAND = 0.3;
+const float PSAO_FLATNESS = 11.0;
+const float PSAO_CORE = 0.2;
+const float PSAO_FADE = 0.3;
+const float PSAO_SEEN = 0.2;
+const float PSAO_UNSEEN = 0.001;
 const uint PSAO_ENTRY_CELL = 4194303u;
-const float PSAO_FAR = 1e30;
 
 uniform highp usampler2D psao_instances;
 
@@ -190,24 +189,23 @@ float psao_paper_weight(float radius, vec3 normal_2, vec3 d, vec3 point_normal) 
 }
 
 float psao_planar_weight(float radius_1, vec3 normal_3, vec3 d_1, vec3 point_normal_1) {
-    float agree = dot(point_normal_1, normal_3);
-    if ((agree <= PSAO_T_N)) {
-        return 0.0;
-    }
+    float agree = max(dot(point_normal_1, normal_3), PSAO_T_N);
     float h = max(abs(dot(normal_3, d_1)), abs(dot(point_normal_1, d_1)));
-    float band = (PSAO_PLANE_BAND * radius_1);
-    float near = max((1.0 - (dot(d_1, d_1) / (radius_1 * radius_1))), 0.0);
-    float flatness = max((1.0 - ((h * h) / (band * band))), 0.0);
+    float apart = (PSAO_CORE + ((dot(d_1, d_1) + (PSAO_FLATNESS * (h * h))) / (radius_1 * radius_1)));
     float agree2_ = (agree * agree);
     float agree4_ = (agree2_ * agree2_);
-    return (((near * flatness) * agree4_) * agree4_);
+    return ((agree4_ * agree4_) / (apart * apart));
+}
+
+float psao_side(vec3 place, uvec3 offset) {
+    vec3 left_1 = mix((vec3(1.5) - place), (place - vec3(0.5)), notEqual(offset, uvec3(0u)));
+    vec3 sides = clamp((left_1 / vec3(0.3)), vec3(0.0), vec3(1.0));
+    return ((sides.x * sides.y) * sides.z);
 }
 
 float psao_blend(bool planar, uint instance_2, vec3 position_2, vec3 normal_4) {
     float weights = 0.0;
     float sum = 0.0;
-    float nearest = 1.0;
-    float nearest_squared = PSAO_FAR;
     uint corner = 0u;
     uint i_1 = 0u;
     float weight = 0.0;
@@ -219,89 +217,84 @@ float psao_blend(bool planar, uint instance_2, vec3 position_2, vec3 normal_4) {
     bool loop_init_1 = true;
     while(true) {
         if (!loop_init_1) {
-            uint _e89 = corner;
-            corner = (_e89 + 1u);
+            uint _e92 = corner;
+            corner = (_e92 + 1u);
         }
         loop_init_1 = false;
-        uint _e18 = corner;
-        if ((_e18 < 8u)) {
+        uint _e14 = corner;
+        if ((_e14 < 8u)) {
         } else {
             break;
         }
         {
+            uint _e17 = corner;
+            uint _e18 = corner;
             uint _e21 = corner;
-            uint _e22 = corner;
-            uint _e25 = corner;
-            uvec3 offset = (uvec3(_e21, (_e22 >> 1u), (_e25 >> 2u)) & uvec3(1u));
-            uvec3 cell_3 = (uvec3(_e5.base) + offset);
+            uvec3 offset_1 = (uvec3(_e17, (_e18 >> 1u), (_e21 >> 2u)) & uvec3(1u));
+            uvec3 cell_3 = (uvec3(_e5.base) + offset_1);
             if (any(greaterThanEqual(cell_3, _e4.dims))) {
                 continue;
             }
-            uint _e38 = psao_find(_e4, cell_3);
-            if ((_e38 == 0u)) {
+            uint _e34 = psao_find(_e4, cell_3);
+            if ((_e34 == 0u)) {
                 continue;
             }
-            vec3 corner_from = (vec3(offset) - _e5.place);
+            vec3 corner_from = (vec3(offset_1) - _e5.place);
+            float _e41 = psao_side(_e5.place, offset_1);
             i_1 = 1u;
             bool loop_init_2 = true;
             while(true) {
                 if (!loop_init_2) {
-                    uint _e86 = i_1;
-                    i_1 = (_e86 + 1u);
+                    uint _e89 = i_1;
+                    i_1 = (_e89 + 1u);
                 }
                 loop_init_2 = false;
-                uint _e46 = i_1;
-                if ((_e46 < 8u)) {
+                uint _e44 = i_1;
+                if ((_e44 < 8u)) {
                 } else {
                     break;
                 }
                 {
-                    uint _e51 = i_1;
-                    uvec4 _e55 = psao_load_cell(((_e38 * 2u) + (_e51 >> 2u)));
-                    uint _e56 = i_1;
-                    uint point_4 = _e55[(_e56 & 3u)];
+                    uint _e49 = i_1;
+                    uvec4 _e53 = psao_load_cell(((_e34 * 2u) + (_e49 >> 2u)));
+                    uint _e54 = i_1;
+                    uint point_4 = _e53[(_e54 & 3u)];
                     if ((point_4 == 0u)) {
                         break;
                     }
                     if ((point_4 < 2147483648u)) {
                         continue;
                     }
-                    vec3 _e64 = psao_point_place(point_4);
-                    vec3 d_2 = (corner_from + _e64);
-                    vec3 _e66 = psao_point_normal(point_4);
-                    float _e67 = psao_point_openness(point_4);
-                    float squared_2 = dot(d_2, d_2);
-                    float _e69 = nearest_squared;
-                    if ((squared_2 < _e69)) {
-                        nearest_squared = squared_2;
-                        nearest = _e67;
-                    }
+                    vec3 _e62 = psao_point_place(point_4);
+                    vec3 d_2 = (corner_from + _e62);
+                    vec3 _e64 = psao_point_normal(point_4);
+                    float _e65 = psao_point_openness(point_4);
                     weight = 0.0;
                     if (planar) {
-                        float _e75 = psao_planar_weight(_e4.radius, _e5.normal, d_2, _e66);
-                        weight = _e75;
+                        float seen = (min((_e65 / PSAO_SEEN), 1.0) + PSAO_UNSEEN);
+                        float _e77 = psao_planar_weight(_e4.radius, _e5.normal, d_2, _e64);
+                        weight = ((_e41 * seen) * _e77);
                     } else {
-                        float _e78 = psao_paper_weight(_e4.radius, _e5.normal, d_2, _e66);
-                        weight = _e78;
+                        float _e81 = psao_paper_weight(_e4.radius, _e5.normal, d_2, _e64);
+                        weight = _e81;
                     }
-                    float _e79 = weights;
-                    float _e80 = weight;
-                    weights = (_e79 + _e80);
-                    float _e82 = sum;
+                    float _e82 = weights;
                     float _e83 = weight;
-                    sum = (_e82 + (_e83 * _e67));
+                    weights = (_e82 + _e83);
+                    float _e85 = sum;
+                    float _e86 = weight;
+                    sum = (_e85 + (_e86 * _e65));
                 }
             }
         }
     }
-    float _e92 = weights;
-    if ((_e92 > 0.0)) {
-        float _e95 = sum;
-        float _e96 = weights;
-        return min((_e95 / _e96), 1.0);
+    float _e95 = weights;
+    if ((_e95 > 0.0)) {
+        float _e98 = sum;
+        float _e99 = weights;
+        return min((_e98 / _e99), 1.0);
     }
-    float _e100 = nearest;
-    return (planar ? _e100 : 1.0);
+    return 1.0;
 }
 
 float psao_planar(uint instance_3, vec3 position_3, vec3 normal_5) {
@@ -319,44 +312,34 @@ uint psao_tag(uint key) {
 }
 
 uint psao_modulo(uint hash, uint count, float inverse_) {
-    uint left_1 = (hash - (uint(((float(hash) * inverse_) * 0.999999)) * count));
-    uint rest = (left_1 - (uint((float(left_1) * inverse_)) * count));
+    uint left_2 = (hash - (uint(((float(hash) * inverse_) * 0.999999)) * count));
+    uint rest = (left_2 - (uint((float(left_2) * inverse_)) * count));
     uint raised = ((rest >= 2147483648u) ? (rest + count) : rest);
     return ((raised >= count) ? (raised - count) : raised);
 }
 
-void psao_add(inout PsaoSum total, vec2 radius_terms, vec3 normal_7, vec3 place, uint point_3) {
+void psao_add(inout vec2 sums, float inverse_radius2_, vec3 normal_7, vec3 place_1, float side, uint point_3) {
     ivec3 steps_1 = ivec3((uvec3(point_3) & uvec3(2031616u, 65011712u, 2080374784u)));
     vec3 scale = vec3(4.7683716e-7, 1.4901161e-8, 4.656613e-10);
-    vec3 d_3 = ((vec3(steps_1) * scale) - place);
+    vec3 d_3 = ((vec3(steps_1) * scale) - place_1);
     ivec2 codes_1 = ivec2((uvec2((point_3 >> 8u), (point_3 >> 12u)) & uvec2(15u)));
     vec2 uv_1 = (vec2(min(codes_1, ivec2(14))) - vec2(7.0));
     float z_1 = ((7.0 - abs(uv_1.x)) - abs(uv_1.y));
     float fold = max(-(z_1), 0.0);
     vec3 m = vec3((uv_1 - mix(vec2(fold), vec2(-(fold)), lessThan(uv_1, vec2(0.0)))), z_1);
     float inverse_1 = (1.0 / dot(m, m));
-    float squared_3 = ((point_3 >= 2147483648u) ? dot(d_3, d_3) : PSAO_FAR);
-    float openness = float(int((point_3 & 255u)));
-    float _e67 = total.nearest_squared;
-    bool closer = (squared_3 < _e67);
-    float _e71 = total.nearest;
-    total.nearest = (closer ? openness : _e71);
-    float _e75 = total.nearest_squared;
-    total.nearest_squared = min(_e75, squared_3);
-    float agree_1 = dot(m, normal_7);
-    float agree2_1 = ((agree_1 > 0.0) ? ((agree_1 * agree_1) * inverse_1) : 0.0);
+    float agree_1 = max(dot(m, normal_7), 0.0);
+    float agree2_1 = max(((agree_1 * agree_1) * inverse_1), 0.010000001);
     float along_1 = dot(normal_7, d_3);
     float point_along = dot(m, d_3);
     float h2_ = max((along_1 * along_1), ((point_along * point_along) * inverse_1));
-    float near_1 = max((1.0 - (squared_3 * radius_terms.x)), 0.0);
-    float flatness_1 = max((1.0 - (h2_ * radius_terms.y)), 0.0);
+    float apart_1 = (PSAO_CORE + ((dot(d_3, d_3) + (PSAO_FLATNESS * h2_)) * inverse_radius2_));
+    float openness = float(int((point_3 & 255u)));
+    float seen_1 = (min((openness * 0.019607844), 1.0) + PSAO_UNSEEN);
     float agree4_1 = (agree2_1 * agree2_1);
-    float weight_1 = (((near_1 * flatness_1) * agree4_1) * agree4_1);
-    float counted = ((agree2_1 > 0.010000001) ? weight_1 : 0.0);
-    float _e111 = total.weights;
-    total.weights = (_e111 + counted);
-    float _e114 = total.sum;
-    total.sum = (_e114 + (counted * openness));
+    float weight_1 = ((((side * seen_1) * agree4_1) * agree4_1) / (apart_1 * apart_1));
+    vec2 _e94 = sums;
+    sums = (_e94 + (((point_3 >= 2147483648u) ? weight_1 : 0.0) * vec2(1.0, openness)));
     return;
 }
 
@@ -417,7 +400,7 @@ float psao_planar_fast(uint instance_5, vec3 position_5, vec3 normal_8) {
     bool local_12 = false;
     bool local_13 = false;
     uint left = 0u;
-    PsaoSum total_1 = PsaoSum(0.0, 0.0, 255.0, 1e30);
+    vec2 sums_1 = vec2(0.0);
     bool second = false;
     uvec4 words = uvec4(0u);
     bool local_14 = false;
@@ -485,82 +468,80 @@ float psao_planar_fast(uint instance_5, vec3 position_5, vec3 normal_8) {
         return _e99;
     }
     left = (((((((((_e13.cell != 0u) ? 1u : 0u) | ((_e19.cell != 0u) ? 2u : 0u)) | ((_e25.cell != 0u) ? 4u : 0u)) | ((_e31.cell != 0u) ? 8u : 0u)) | ((_e37.cell != 0u) ? 16u : 0u)) | ((_e43.cell != 0u) ? 32u : 0u)) | ((_e49.cell != 0u) ? 64u : 0u)) | ((_e55.cell != 0u) ? 128u : 0u));
-    float near_term = (1.0 / (_e3.radius * _e3.radius));
-    vec2 radius_terms_1 = vec2(near_term, (near_term / 0.09));
+    float inverse_radius2_1 = (1.0 / (_e3.radius * _e3.radius));
     while(true) {
-        uint _e172 = left;
-        if ((_e172 != 0u)) {
+        uint _e166 = left;
+        if ((_e166 != 0u)) {
         } else {
             break;
         }
         {
-            uint _e175 = left;
-            uint _e177 = left;
-            uint corner_1 = ((floatBitsToUint(float(int((_e175 & (0u - _e177))))) >> 23u) - 127u);
-            uvec3 offset_1 = (uvec3(corner_1, (corner_1 >> 1u), (corner_1 >> 2u)) & uvec3(1u));
-            bool right = (offset_1.x != 0u);
-            bool back = (offset_1.y != 0u);
+            uint _e169 = left;
+            uint _e171 = left;
+            uint corner_1 = ((floatBitsToUint(float(int((_e169 & (0u - _e171))))) >> 23u) - 127u);
+            uvec3 offset_2 = (uvec3(corner_1, (corner_1 >> 1u), (corner_1 >> 2u)) & uvec3(1u));
+            bool right = (offset_2.x != 0u);
+            bool back = (offset_2.y != 0u);
             uint lower_1 = (back ? (right ? _e31.cell : _e25.cell) : (right ? _e19.cell : _e13.cell));
             uint upper = (back ? (right ? _e55.cell : _e49.cell) : (right ? _e43.cell : _e37.cell));
-            uint found = ((offset_1.z != 0u) ? upper : lower_1);
-            bool _e223 = second;
-            uvec4 _e226 = psao_load_cell(((found * 2u) + (_e223 ? 1u : 0u)));
-            words = _e226;
-            bool _e228 = second;
-            if (!(_e228)) {
-                uint _e233 = words.x;
-                uint _e237 = psao_weigh(_e3, (base + offset_1), 1u, 1u);
-                local_14 = (_e233 != _e237);
+            uint found = ((offset_2.z != 0u) ? upper : lower_1);
+            bool _e217 = second;
+            uvec4 _e220 = psao_load_cell(((found * 2u) + (_e217 ? 1u : 0u)));
+            words = _e220;
+            bool _e222 = second;
+            if (!(_e222)) {
+                uint _e227 = words.x;
+                uint _e231 = psao_weigh(_e3, (base + offset_2), 1u, 1u);
+                local_14 = (_e227 != _e231);
             } else {
                 local_14 = false;
             }
-            bool _e240 = local_14;
-            if (_e240) {
+            bool _e234 = local_14;
+            if (_e234) {
                 words = uvec4(0u);
             }
-            uint _e245 = words.x;
-            bool _e246 = second;
-            uint a = (_e246 ? _e245 : 0u);
-            uint _e249 = words.y;
-            bool _e251 = second;
-            if (_e251) {
+            uint _e239 = words.x;
+            bool _e240 = second;
+            uint a = (_e240 ? _e239 : 0u);
+            uint _e243 = words.y;
+            bool _e245 = second;
+            if (_e245) {
                 local_15 = (a == 0u);
             } else {
                 local_15 = false;
             }
-            bool _e257 = local_15;
-            uint b = (_e257 ? 0u : _e249);
-            uint _e261 = words.z;
-            uint c = ((b != 0u) ? _e261 : 0u);
-            uint _e267 = words.w;
-            uint d_4 = ((c != 0u) ? _e267 : 0u);
-            vec3 place_1 = ((_e4.place - vec3(0.015625)) - vec3(ivec3(offset_1)));
-            bool _e278 = second;
-            if (_e278) {
-                psao_add(total_1, radius_terms_1, _e4.normal, place_1, a);
+            bool _e251 = local_15;
+            uint b = (_e251 ? 0u : _e243);
+            uint _e255 = words.z;
+            uint c = ((b != 0u) ? _e255 : 0u);
+            uint _e261 = words.w;
+            uint d_4 = ((c != 0u) ? _e261 : 0u);
+            float _e266 = psao_side(_e4.place, offset_2);
+            vec3 place_2 = ((_e4.place - vec3(0.015625)) - vec3(ivec3(offset_2)));
+            bool _e274 = second;
+            if (_e274) {
+                psao_add(sums_1, inverse_radius2_1, _e4.normal, place_2, _e266, a);
             }
-            psao_add(total_1, radius_terms_1, _e4.normal, place_1, b);
-            psao_add(total_1, radius_terms_1, _e4.normal, place_1, c);
-            psao_add(total_1, radius_terms_1, _e4.normal, place_1, d_4);
-            bool _e283 = second;
-            if (!(_e283)) {
+            psao_add(sums_1, inverse_radius2_1, _e4.normal, place_2, _e266, b);
+            psao_add(sums_1, inverse_radius2_1, _e4.normal, place_2, _e266, c);
+            psao_add(sums_1, inverse_radius2_1, _e4.normal, place_2, _e266, d_4);
+            bool _e279 = second;
+            if (!(_e279)) {
                 local_16 = (d_4 != 0u);
             } else {
                 local_16 = false;
             }
-            bool _e290 = local_16;
-            second = _e290;
-            uint _e291 = left;
+            bool _e286 = local_16;
+            second = _e286;
+            uint _e287 = left;
+            uint _e288 = left;
             uint _e292 = left;
-            uint _e296 = left;
-            bool _e297 = second;
-            left = (_e297 ? _e296 : (_e291 & (_e292 - 1u)));
+            bool _e293 = second;
+            left = (_e293 ? _e292 : (_e287 & (_e288 - 1u)));
         }
     }
-    float _e300 = total_1.nearest;
-    float _e302 = total_1.sum;
-    float _e304 = total_1.weights;
-    float _e307 = total_1.weights;
-    float openness_1 = ((_e307 > 0.0) ? (_e302 / _e304) : _e300);
-    return min((openness_1 * 0.003921569), 1.0);
+    float _e296 = sums_1.y;
+    float _e298 = sums_1.x;
+    float _e305 = sums_1.x;
+    return ((_e305 > 0.0) ? min(((_e296 / _e298) * 0.003921569), 1.0) : 1.0);
 }
