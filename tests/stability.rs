@@ -49,7 +49,6 @@ fn reference(
     let radius = f64::from(grid.radius);
     let base = (g - 0.5).floor();
     let (mut weights, mut sum) = (0.0, 0.0);
-    let mut nearest = (f64::INFINITY, 1.0);
     for corner in 0..8 {
         let cell = base + DVec3::from([corner & 1, corner >> 1 & 1, corner >> 2].map(f64::from));
         if (0..3).any(|axis| cell[axis] < 0.0 || cell[axis] >= dims[axis]) {
@@ -62,27 +61,27 @@ fn reference(
             let step = DVec3::from(point.position().map(f64::from));
             let d = cell + (step + 0.5) / 32.0 - g;
             let openness = f64::from(point.occlusion()) / 255.0;
-            if d.length_squared() < nearest.0 {
-                nearest = (d.length_squared(), openness);
+            let mut weight = weight(kernel, d, radius, normal, normal_of(point.normal()));
+            if kernel == Kernel::Planar {
+                weight *= (5.0 * openness).min(1.0) + 0.001;
+                for axis in 0..3 {
+                    let place = g[axis] - base[axis];
+                    let upper = cell[axis] > base[axis];
+                    let left = if upper { place - 0.5 } else { 1.5 - place };
+                    weight *= (left / 0.3).min(1.0);
+                }
             }
-            let weight = weight(kernel, d, radius, normal, normal_of(point.normal()));
             weights += weight;
             sum += weight * openness;
         }
     }
-    match kernel {
-        _ if weights > 0.0 => sum / weights,
-        Kernel::Paper => 1.0,
-        Kernel::Planar => nearest.1,
-    }
+    if weights > 0.0 { sum / weights } else { 1.0 }
 }
 
 fn weight(kernel: Kernel, d: DVec3, radius: f64, n: DVec3, n_p: DVec3) -> f64 {
     let agree = n.dot(n_p);
-    if agree <= 0.1 {
-        return 0.0;
-    }
     match kernel {
+        Kernel::Paper if agree <= 0.1 => 0.0,
         Kernel::Paper => {
             let along = n_p.dot(d);
             if along * along >= 0.7 * d.length_squared() && d != DVec3::ZERO {
@@ -91,9 +90,9 @@ fn weight(kernel: Kernel, d: DVec3, radius: f64, n: DVec3, n_p: DVec3) -> f64 {
             ((radius - d.length()) / radius).max(0.0)
         }
         Kernel::Planar => {
-            let h = n.dot(d).abs().max(n_p.dot(d).abs()) / (0.3 * radius);
-            let near = (1.0 - d.length_squared() / (radius * radius)).max(0.0);
-            near * (1.0 - h * h).max(0.0) * agree.powi(8)
+            let h = n.dot(d).abs().max(n_p.dot(d).abs());
+            let far = (d.length_squared() + 11.0 * h * h) / (radius * radius);
+            agree.max(0.1).powi(8) / (0.2 + far).powi(2)
         }
     }
 }

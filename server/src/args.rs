@@ -3,7 +3,8 @@
 use crate::camera::CameraPath;
 use crate::encode::{Compression, Limits, Scheme};
 use crate::points::SurfacePoint;
-use crate::scene::{Placement, Scene};
+use crate::rays::Tracer;
+use crate::scene::{Placement, Pose, Scene};
 use crate::server::Settings;
 use crate::world::{MAX_REFRESH_STEPS, Options, Progress, World};
 use clap::{Args, ValueEnum};
@@ -62,6 +63,15 @@ pub enum KernelArg {
     Planar,
     /// Eq. 2 to 4 of the paper
     Paper,
+}
+
+/// How points are spread, by name.
+#[derive(ValueEnum, Clone, Copy, Debug, PartialEq, Eq)]
+pub enum PlacementArg {
+    /// Evenly over all surfaces
+    Uniform,
+    /// Denser where occlusion changes fast
+    Adaptive,
 }
 
 /// Compression by name.
@@ -247,21 +257,45 @@ impl StreamArgs {
 /// # Errors
 /// The scene has no extent.
 pub fn camera_path(world: &World, which: u32, aspect: f32) -> Result<CameraPath, String> {
+    let vertices = |instance| world.vertices(instance).0;
+    path_through(
+        &world.scene,
+        &world.pose,
+        world.tracer(),
+        &vertices,
+        which,
+        aspect,
+    )
+}
+
+/// The same of a scene in a pose, without points. `vertices`: positions of an instance's vertices,
+/// in local space.
+///
+/// # Errors
+/// As [`camera_path`].
+pub fn path_through<'a>(
+    scene: &Scene,
+    pose: &Pose,
+    tracer: &dyn Tracer,
+    vertices: &(dyn Fn(u32) -> &'a [Vec3] + Sync),
+    which: u32,
+    aspect: f32,
+) -> Result<CameraPath, String> {
     let closest = |origin: Vec3, direction: Vec3| {
-        let hit = world.tracer().closest(origin, direction, f32::INFINITY)?;
-        let instance = &world.scene.instances[hit.instance as usize];
-        let mesh = &world.scene.meshes[instance.mesh as usize];
+        let hit = tracer.closest(origin, direction, f32::INFINITY)?;
+        let instance = &scene.instances[hit.instance as usize];
+        let mesh = &scene.meshes[instance.mesh as usize];
         let point = SurfacePoint {
             triangle: hit.triangle,
             u: hit.u,
             v: hit.v,
             back: false,
         };
-        let local = point.geometric_normal(&mesh.triangles, world.vertices(hit.instance).0);
-        let normal = world.pose.instances[hit.instance as usize].world_normal(local);
+        let local = point.geometric_normal(&mesh.triangles, vertices(hit.instance));
+        let normal = pose.instances[hit.instance as usize].world_normal(local);
         // Both sides of what has two are fronts.
         let away = mesh.double_sided && normal.dot(direction) > 0.0;
         Some((hit.t, if away { -normal } else { normal }))
     };
-    CameraPath::find(world.scene.bounds(&world.pose), which, aspect, &closest)
+    CameraPath::find(scene.bounds(pose), which, aspect, &closest)
 }

@@ -286,8 +286,9 @@ pub fn play(args: &PlayArgs) -> Result<Table, String> {
     Ok(player.table())
 }
 
-/// A third for cells, as many points as are usual in them, and what goes with both.
-fn capacity_within(mebibytes: u64) -> Capacity {
+/// The largest mirror in this much memory: a third for cells, as many points as are usual in them,
+/// and what goes with both.
+pub fn capacity_within(mebibytes: u64) -> Capacity {
     let cells = (mebibytes.min(1 << 20) << 20) / 3 / size_of::<Cell>() as u64;
     let cells = u32::try_from(cells).unwrap_or(MAX_CELLS).min(MAX_CELLS);
     Capacity {

@@ -56,7 +56,11 @@ pub struct DemoArgs {
     pub json: Option<PathBuf>,
 }
 
-pub(crate) fn parse_size(text: &str) -> Result<(usize, usize), String> {
+/// A picture's size as on the command line: `480x270`.
+///
+/// # Errors
+/// It is none, or an edge is not 16 to 8192.
+pub fn parse_size(text: &str) -> Result<(usize, usize), String> {
     let parse = || {
         let (width, height) = text.split_once('x')?;
         let size: (usize, usize) = (width.parse().ok()?, height.parse().ok()?);

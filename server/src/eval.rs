@@ -5,7 +5,10 @@
 //! one world, so they differ in nothing but the quantiser. The two profiles need a world each (one
 //! in rest space), which trace the same rays along the same camera path.
 
-use crate::args::{ProfileArg, SceneArgs, camera_path};
+pub mod kernels;
+mod variants;
+
+use crate::args::{PlacementArg, ProfileArg, SceneArgs, camera_path};
 use crate::camera::{CameraPath, Frustum};
 use crate::demo::parse_size;
 use crate::encode::{Compression, Encoder, Eye, Limits, Scheme, View as Sight, capacity_of};
@@ -82,9 +85,19 @@ pub struct EvalArgs {
     #[arg(long, value_name = "N", default_value_t = 60,
           value_parser = clap::value_parser!(u32).range(2..=100_000))]
     pub frames: u32,
-    /// Which of the two camera paths to walk
-    #[arg(long, value_name = "N", default_value_t = 1,
-          value_parser = clap::value_parser!(u32).range(0..=1))]
+    /// Kernels to compare instead of profiles: paper, paper-nearest, planar, ..., each with its
+    /// radius over rm and cell size over the radius if they are not the usual ones
+    #[arg(long, value_name = "NAME[@R[/C]],...", value_delimiter = ',')]
+    pub kernels: Vec<kernels::Variant>,
+    /// Points that a cell holds (with --kernels)
+    #[arg(long, value_name = "N,...", value_delimiter = ',', default_value = "7",
+          value_parser = clap::value_parser!(u8).range(1..=15))]
+    pub capacities: Vec<u8>,
+    /// How points are spread (with --kernels)
+    #[arg(long, value_enum, value_delimiter = ',', default_value = "adaptive")]
+    pub placements: Vec<PlacementArg>,
+    /// Which of the two camera paths to walk: tune (or 0) and check (or 1)
+    #[arg(long, value_name = "PATH", default_value = "check", value_parser = parse_path)]
     pub path: u32,
     /// Frames at each rate that are compared with a ray-traced picture
     #[arg(long, value_name = "N", default_value_t = 2,
@@ -99,6 +112,14 @@ pub struct EvalArgs {
     /// Folder for report.html, with the plots
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
+}
+
+fn parse_path(text: &str) -> Result<u32, String> {
+    match text {
+        "tune" | "0" => Ok(0),
+        "check" | "1" => Ok(1),
+        _ => Err(format!("{text} is neither tune nor check")),
+    }
 }
 
 fn parse_quantiser(text: &str) -> Result<Quantiser, String> {
@@ -615,7 +636,7 @@ fn mean(values: &[f64]) -> f64 {
 }
 
 /// The value that this share of the values is below.
-fn percentile(values: &[f64], share: f64) -> f64 {
+pub(crate) fn percentile(values: &[f64], share: f64) -> f64 {
     let mut sorted = values.to_vec();
     sorted.sort_by(f64::total_cmp);
     let index = (sorted.len() as f64 * share) as usize;
@@ -649,6 +670,31 @@ fn bits_at(rmse: f64, measured: &[(f64, f64)]) -> Option<(f64, bool)> {
     let bits = (y0.ln() + along * (y1.ln() - y0.ln())).exp();
     let extrapolated = rmse < pairs[0].0 || rmse > pairs[pairs.len() - 1].0;
     Some((bits, extrapolated))
+}
+
+/// Lines as a table whose columns line up, the first its head.
+fn aligned<const N: usize>(lines: &[[String; N]]) -> String {
+    let wide = |column: usize| {
+        let cells = lines.iter().map(|line| line[column].chars().count());
+        cells.max().unwrap_or(0)
+    };
+    let widths: [usize; N] = std::array::from_fn(wide);
+    let rule = widths.map(|width| "-".repeat(width));
+    let join = |line: &[String; N]| {
+        let cells = line.iter().zip(&widths);
+        let cells: Vec<String> = cells
+            .map(|(cell, width)| format!("{cell:width$}"))
+            .collect();
+        format!("| {} |\n", cells.join(" | "))
+    };
+    let mut out = String::new();
+    for (number, line) in lines.iter().enumerate() {
+        out += &join(line);
+        if number == 0 {
+            out += &join(&rule);
+        }
+    }
+    out
 }
 
 impl Evaluation {
@@ -738,21 +784,7 @@ impl Evaluation {
                 format!("{:.1}", row.client_bytes as f64 / 1e6),
             ]);
         }
-        let wide = |column: usize| {
-            let cells = lines.iter().map(|line| line[column].chars().count());
-            cells.max().unwrap_or(0)
-        };
-        let widths: Vec<usize> = (0..heads.len()).map(wide).collect();
-        let rule: Vec<String> = widths.iter().map(|width| "-".repeat(*width)).collect();
-        let join = |line: &[String]| {
-            let cells = line.iter().zip(&widths);
-            let cells: Vec<String> = cells
-                .map(|(cell, width)| format!("{cell:width$}"))
-                .collect();
-            format!("| {} |\n", cells.join(" | "))
-        };
-        let mut out = join(&lines[0]) + &join(&rule);
-        lines[1..].iter().for_each(|line| out += &join(line));
+        let mut out = aligned(&lines);
         out += "\n";
         for (what, value) in self.conclusions() {
             out += &format!("{what}: {value}\n");

@@ -1,11 +1,15 @@
 //! The PSAO reference server: `scene ─► points ─► occlusion ─► select ─► encode ─► transport`.
 
 pub mod args;
+#[cfg(feature = "gpu")]
+pub mod bench_gpu;
 pub mod camera;
 pub mod commands;
 pub mod demo;
 pub mod encode;
 pub mod eval;
+#[cfg(feature = "gpu")]
+pub mod gpu;
 pub mod identity;
 pub mod metrics;
 pub mod picture;

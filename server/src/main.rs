@@ -2,6 +2,8 @@
 
 use clap::{Parser, Subcommand};
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
+#[cfg(feature = "gpu")]
+use psao_server::bench_gpu::{self, BenchGpuArgs};
 use psao_server::commands::{self, InspectArgs, PlayArgs, RecordArgs, ServeArgs};
 use psao_server::demo::{self, DemoArgs};
 use psao_server::eval::{self, EvalArgs};
@@ -32,6 +34,9 @@ enum Command {
     Inspect(InspectArgs),
     /// Measures bits, error and time of the profiles on the same frames
     Eval(Box<EvalArgs>),
+    /// Races the lookup on the GPU against screen-space and ray-traced occlusion
+    #[cfg(feature = "gpu")]
+    BenchGpu(Box<BenchGpuArgs>),
 }
 
 fn main() -> ExitCode {
@@ -60,9 +65,20 @@ fn main() -> ExitCode {
         Command::Inspect(args) => {
             commands::inspect(args, &mut std::io::stdout().lock()).map(|()| String::new())
         }
+        Command::Eval(args) if !args.kernels.is_empty() => {
+            eval::kernels::run(args, &progress).map(|found| {
+                bars.finish();
+                found.table()
+            })
+        }
         Command::Eval(args) => eval::run(args, &progress).map(|found| {
             bars.finish();
             found.table()
+        }),
+        #[cfg(feature = "gpu")]
+        Command::BenchGpu(args) => bench_gpu::run(args, &progress).map(|race| {
+            bars.finish();
+            race.table()
         }),
     };
     let result = result.and_then(|text| {

@@ -53,6 +53,19 @@ impl Picture {
         Self::per_pixel(grey, valid, width, height, |v| [byte(v); 3])
     }
 
+    /// A colour image of bytes, red, green and blue in turn.
+    ///
+    /// # Panics
+    /// If `rgb` is not `width * height * 3` long.
+    pub fn rgb(rgb: Vec<u8>, width: usize, height: usize) -> Self {
+        assert_eq!(
+            rgb.len(),
+            width * height * 3,
+            "bytes of {width} x {height} pixels"
+        );
+        Self { width, height, rgb }
+    }
+
     /// A map of errors: their size from black (0) over magenta to pale yellow (`max` and more),
     /// with the ramp and its ends drawn below, so that it is a little higher than `height`.
     /// Pixels that are not `valid` are pale blue. Give maps that are to be compared the same

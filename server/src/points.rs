@@ -6,10 +6,12 @@
 //! points is an even, coarser set.
 
 mod eliminate;
+pub mod pilot;
 
 use crate::scene::Mesh;
 use eliminate::{Sample, eliminate};
 use glam::{DVec3, Vec3};
+use pilot::Density;
 use rayon::prelude::*;
 use std::fmt;
 
@@ -162,6 +164,30 @@ pub fn generate(
     density: f64,
     seed: u64,
 ) -> Result<PointSet, PointError> {
+    spread_over(mesh, metric, density, None, seed)
+}
+
+/// As [`generate`], denser here than there; how many points there are depends on it too.
+///
+/// # Errors
+/// As [`generate`].
+pub fn generate_adaptive(
+    mesh: &Mesh,
+    metric: Vec3,
+    density: f64,
+    factors: &Density,
+    seed: u64,
+) -> Result<PointSet, PointError> {
+    spread_over(mesh, metric, density, Some(factors), seed)
+}
+
+fn spread_over(
+    mesh: &Mesh,
+    metric: Vec3,
+    density: f64,
+    factors: Option<&Density>,
+    seed: u64,
+) -> Result<PointSet, PointError> {
     if !(density.is_finite() && density > 0.0) {
         return Err(PointError::Density(density));
     }
@@ -185,17 +211,42 @@ pub fn generate(
         return Ok(PointSet::default());
     }
     // A tiny mesh needs some candidates more, to find what the mask leaves of it.
-    let per_side = ((CANDIDATES_PER_POINT * density * areas.total()).round() as u32).max(64);
-    let candidates = strew(mesh, &areas, sides, per_side, seed);
+    let most = if factors.is_some() { pilot::MOST } else { 1.0 };
+    let per_side = CANDIDATES_PER_POINT * density * areas.total() * f64::from(most);
+    let per_side = (per_side.round() as u32).max(64);
+    let mut candidates = strew(mesh, &areas, sides, per_side, seed);
     let area_m2 = area_m2 * candidates.len() as f64 / f64::from(per_side * sides);
-    let count = (area_m2 * density).round() as usize;
+    let mut of_candidates = Vec::new();
+    if let Some(factors) = factors {
+        // Candidates lie as dense as points are to.
+        let drawn = |(k, c): (usize, SurfacePoint)| {
+            let factor = factors.at(mesh, &c);
+            let chance = (scramble(seed ^ scramble(!(k as u64))) >> 40) as f32 / (1 << 24) as f32;
+            (chance * most < factor).then_some((c, factor))
+        };
+        (candidates, of_candidates) = candidates
+            .into_par_iter()
+            .enumerate()
+            .filter_map(drawn)
+            .unzip();
+    }
+    let share = match factors {
+        // What is left of them is CANDIDATES_PER_POINT times the points.
+        Some(_) => candidates.len() as f64 / CANDIDATES_PER_POINT / density,
+        None => area_m2,
+    };
+    let count = (share * density).round() as usize;
     if count <= sides as usize {
         let front = candidates.iter().find(|c| !c.back);
         let back = candidates.iter().find(|c| c.back);
         let points = front.into_iter().chain(back).copied().collect();
         return Ok(PointSet { points, area_m2 });
     }
-    let order = progressive_order(&samples(mesh, metric, &candidates), count, density);
+    let mut samples = samples(mesh, metric, &candidates);
+    for (sample, factor) in samples.iter_mut().zip(of_candidates) {
+        sample.stretch = factor.sqrt();
+    }
+    let order = progressive_order(&samples, count, density);
     let points = order.into_iter().map(|i| candidates[i as usize]).collect();
     Ok(PointSet { points, area_m2 })
 }
@@ -344,6 +395,7 @@ fn samples(mesh: &Mesh, metric: Vec3, candidates: &[SurfacePoint]) -> Vec<Sample
             Sample {
                 position: (position(c) - lowest).as_vec3().to_array(),
                 normal: (normal * 127.0).round().to_array().map(|n| n as i8),
+                stretch: 1.0,
             }
         })
         .collect()

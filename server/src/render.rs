@@ -21,12 +21,12 @@ pub struct Fragment {
     /// Shading normal in that space, towards the viewer's side of a double-sided surface.
     pub normal: Vec3,
     /// World position, metres from the scene's origin.
-    world_position: Vec3,
-    world_normal: Vec3,
+    pub world_position: Vec3,
+    pub(crate) world_normal: Vec3,
     /// Normal of the flat triangle, in the world.
-    outward: Vec3,
+    pub(crate) outward: Vec3,
     /// World direction of a triangle edge.
-    tangent: Vec3,
+    pub(crate) tangent: Vec3,
 }
 
 /// The fragments a camera sees, row by row from the top; none where it sees the sky.

@@ -114,6 +114,18 @@ impl Samples {
         }
     }
 
+    /// All sets, one after the other, each direction around z with a zero behind it; for shaders.
+    #[cfg(feature = "gpu")]
+    pub(crate) fn table(&self) -> Vec<[f32; 4]> {
+        let mut table = vec![[0.0; 4]; SETS * self.rays];
+        for (set, out) in self.sets.iter().zip(table.chunks_mut(self.rays)) {
+            for index in 0..self.rays {
+                out[set.given(index)] = set.direction(index).extend(0.0).into();
+            }
+        }
+        table
+    }
+
     /// The rays of a point from `origin`, in the directions of [`Samples::directions`].
     pub fn fan(&self, point_id: u32, origin: Vec3, normal: Vec3, tangent: Vec3) -> Fan<'_> {
         let bits = hash(point_id);

@@ -57,10 +57,15 @@ impl PointSet {
             .fold([Vec3::INFINITY, Vec3::NEG_INFINITY], |[min, max], p| {
                 [min.min(*p), max.max(*p)]
             });
+        let place = |(point, at): (&SurfacePoint, &Vec3)| {
+            let normal = point.normal(&mesh.triangles, &mesh.positions, &mesh.normals);
+            Placement::of(grid, *at, normal)
+        };
+        let mut places: Vec<Option<Placement>> = points.iter().zip(&local).map(place).collect();
+        leave_room(&mut places);
         let coded = |index: u32| {
             let point = &points[index as usize];
-            let normal = point.normal(&mesh.triangles, &mesh.positions, &mesh.normals);
-            let at = Placement::of(grid, local[index as usize], normal)?;
+            let at = places[index as usize]?;
             let mut coded = PatchPoint {
                 normal: at.normal,
                 level: level_of_rank(index as usize, points.len()),
@@ -143,6 +148,21 @@ impl PointSet {
     pub fn patch_range(&self, patch: usize) -> Range<usize> {
         let first = patch * PATCH_POINTS;
         first..(first + PATCH_POINTS).min(self.coded.len())
+    }
+}
+
+/// Drops what a cell has no room for. The first points of the progressive order stay: they are
+/// spread well over all that the cell holds, such as both sides of a thin wall, which those that
+/// a client happens to get first need not be.
+fn leave_room(places: &mut [Option<Placement>]) {
+    let mut loads: HashMap<[u32; 3], usize, Fast> = HashMap::default();
+    for place in places {
+        let Some(at) = place else { continue };
+        let load = loads.entry(at.cell).or_default();
+        *load += 1;
+        if *load > CELL_POINTS {
+            *place = None;
+        }
     }
 }
 

@@ -5,7 +5,10 @@
 //! against geometry that a point is rigidly attached to are traced once and kept as bits; the
 //! others again only when something moved within their reach.
 
-use crate::points::{PointError, SurfacePoint, generate, largest_radius, morton_order};
+use crate::points::pilot::{Density, PILOT_RAYS, Pilot, densities};
+use crate::points::{
+    PointError, SurfacePoint, generate, generate_adaptive, largest_radius, morton_order,
+};
 use crate::rays::{
     Against, CpuTracer, Deformed, Fan, TooManyTriangles, Tracer, offset_origin, reach,
 };
@@ -48,6 +51,8 @@ pub struct Options {
     pub radius_over_rm: f32,
     /// Cell size c over r.
     pub cell_over_radius: f32,
+    /// Points lie denser where occlusion changes fast, and as many fewer elsewhere.
+    pub adaptive: bool,
     /// Seed of the point placement.
     pub seed: u64,
     /// Points are laid out for profile `residual`: in rest space, a mesh's for all its instances
@@ -58,12 +63,12 @@ pub struct Options {
 
 impl Options {
     /// The defaults of a kernel. `Paper`: r is the spacing that elimination reaches, 1.41 rm, and
-    /// 2×2×2 cells cover the whole radius (c = 2r). `Planar`: r = 2 rm and c = 1.25 r, where
-    /// 2×2×2 cells hold everything nearer than 0.625 r, and fewer points are read.
+    /// 2×2×2 cells cover the whole radius (c = 2r). `Planar`: r = 2 rm and c = 1.1 r, where
+    /// 2×2×2 cells hold everything nearer than 0.55 r, and fewer points are read.
     pub fn of(kernel: Kernel) -> Options {
         let (radius_over_rm, cell_over_radius) = match kernel {
             Kernel::Paper => (1.41, 2.0),
-            Kernel::Planar => (2.0, 1.25),
+            Kernel::Planar => (2.0, 1.1),
         };
         Options {
             density: 512.0,
@@ -73,6 +78,7 @@ impl Options {
             kernel,
             radius_over_rm,
             cell_over_radius,
+            adaptive: true,
             seed: 1,
             rest_space: false,
         }
@@ -262,9 +268,13 @@ impl World {
             }
         }
         deform(&scene, &pose, &mut deformed);
-        let tracer =
+        let mut tracer =
             CpuTracer::new(&scene, &pose, &deformed, &moves).map_err(WorldError::Triangles)?;
-        let sets = place_points(&scene, &pose, &deformed, &options, progress)?;
+        let users = shared_points(&scene, &pose, &deformed, &options)?;
+        let factors = options
+            .adaptive
+            .then(|| try_places(&scene, &users, &options, &moves, &mut tracer, progress));
+        let sets = place_points(&scene, users, factors, &options, progress)?;
 
         let mut world = World {
             samples: Samples::new(options.rays),
@@ -1504,14 +1514,33 @@ impl Sampled {
     }
 }
 
-/// Paper, 3.1: points a mesh.
-fn place_points(
+/// The instances that share points, and their scales (local units to metres).
+struct Users {
+    mesh: u32,
+    users: Vec<(u32, Vec3)>,
+}
+
+impl Users {
+    /// The scale of the largest.
+    fn largest(&self) -> Vec3 {
+        let volume = |s: &Vec3| s.x * s.y * s.z;
+        let scales = self.users.iter().map(|(_, s)| *s);
+        scales.fold(
+            Vec3::ZERO,
+            |a, b| {
+                if volume(&b) > volume(&a) { b } else { a }
+            },
+        )
+    }
+}
+
+/// Which instances share points, large meshes first.
+fn shared_points(
     scene: &Scene,
     pose: &Pose,
     deformed: &[Deformed],
     options: &Options,
-    progress: Progress<'_>,
-) -> Result<Vec<Sampled>, WorldError> {
+) -> Result<Vec<Users>, WorldError> {
     // Instances share points if their mesh is the same and scaled by the same ratios.
     let mut sets: BTreeMap<(u32, [i32; 2]), Vec<(u32, Vec3)>> = BTreeMap::new();
     for (index, instance) in scene.instances.iter().enumerate() {
@@ -1547,37 +1576,142 @@ fn place_points(
     if options.density.is_finite() && count > MAX_POINTS as f64 {
         return Err(WorldError::TooManyPoints(count as u64));
     }
+    // Large meshes first, so that none is left for the end alone.
+    let sets = sets.into_iter();
+    let mut sets: Vec<Users> = sets
+        .map(|((mesh, _), users)| Users { mesh, users })
+        .collect();
+    sets.sort_by_key(|set| std::cmp::Reverse(scene.meshes[set.mesh as usize].triangles.len()));
+    Ok(sets)
+}
+
+/// Poses in which places on what moves or bends are tried, evenly over the animations.
+const PILOT_POSES: usize = 3;
+
+/// Most instances of a mesh on which its places are tried.
+const PILOT_USERS: usize = 4;
+
+/// Traces a few rays from a few places of each mesh, and says how dense its points are to lie.
+/// What stands still is tried among what stands still; the rest in several poses, among all.
+fn try_places(
+    scene: &Scene,
+    sets: &[Users],
+    options: &Options,
+    moves: &[bool],
+    tracer: &mut CpuTracer,
+    progress: Progress<'_>,
+) -> Vec<Density> {
+    let seed = |mesh: u32| options.seed.wrapping_add(u64::from(mesh));
+    let mut pilots: Vec<Pilot> = sets
+        .par_iter()
+        .map(|set| {
+            let mesh = &scene.meshes[set.mesh as usize];
+            Pilot::new(mesh, set.largest(), options.density, seed(set.mesh))
+        })
+        .collect();
+    let samples = Samples::new(PILOT_RAYS);
+    let animations = scene.animations.iter();
+    let longest = animations.map(|a| a.duration_s).fold(0.0, f32::max);
+    let any_moves = moves.iter().any(|moves| *moves);
+    let poses = if any_moves { PILOT_POSES } else { 1 };
+    let (mut pose, mut deformed) = (Pose::default(), Vec::new());
+    for index in (0..scene.instances.len()).filter(|&i| scene.instances[i].deforms) {
+        deformed.push(Deformed {
+            instance: index as u32,
+            ..Deformed::default()
+        });
+    }
+    // Backwards, so that the tracer ends in the first pose.
+    for number in (0..poses).rev() {
+        let time = f64::from(longest) * number as f64 / poses as f64;
+        scene.pose(time, &mut pose);
+        deform(scene, &pose, &mut deformed);
+        tracer.update(scene, &pose, &deformed);
+        let total = sets.len() as u64;
+        for (done, (set, pilot)) in sets.iter().zip(&mut pilots).enumerate() {
+            let step = set.users.len().div_ceil(PILOT_USERS);
+            for &(instance, _) in set.users.iter().step_by(step) {
+                let index = instance as usize;
+                if number > 0 && !moves[index] {
+                    continue;
+                }
+                let against = if moves[index] {
+                    Against::All
+                } else {
+                    Against::Static
+                };
+                let mesh = &scene.meshes[set.mesh as usize];
+                let at = deformed.binary_search_by_key(&instance, |d| d.instance);
+                let (positions, normals) = match at {
+                    Ok(at) => (&deformed[at].positions, &deformed[at].normals),
+                    Err(_) => (&mesh.positions, &mesh.normals),
+                };
+                let placed = &pose.instances[index];
+                let reach = reach(&placed.world_from_local, extent(mesh));
+                let openness = |(number, place): (usize, &SurfacePoint)| {
+                    let triangles = &mesh.triangles;
+                    let normal = placed.world_normal(place.normal(triangles, positions, normals));
+                    let outward = placed.world_normal(place.geometric_normal(triangles, positions));
+                    let position = place.position(triangles, positions);
+                    let position = placed.world_from_local.transform_point3(position);
+                    let tangent = place.tangent(triangles, positions);
+                    let tangent = placed.world_from_local.transform_vector3(tangent);
+                    let origin = offset_origin(position, outward, reach);
+                    let fan = samples.fan(number as u32, origin, normal, tangent);
+                    let mut hit = [0];
+                    let todo = [(1 << PILOT_RAYS) - 1];
+                    tracer.occluded_fan(against, &fan, options.ao_distance_m, &todo, &mut hit);
+                    1.0 - count(&hit) as f32 / PILOT_RAYS as f32
+                };
+                let openness: Vec<f32> =
+                    pilot.places.par_iter().enumerate().map(openness).collect();
+                // Instances and poses count alike.
+                let times = set.users.len().div_ceil(step) * if moves[index] { poses } else { 1 };
+                pilot.add(&openness, 1.0 / times as f32);
+            }
+            progress("pilot", done as u64 + 1, total);
+        }
+    }
+    let pilots = pilots.into_iter().zip(sets);
+    let pilots: Vec<(Pilot, &Mesh, usize)> = pilots
+        .map(|(pilot, set)| (pilot, &scene.meshes[set.mesh as usize], set.users.len()))
+        .collect();
+    densities(&pilots)
+}
+
+/// Paper, 3.1: points a mesh.
+fn place_points(
+    scene: &Scene,
+    sets: Vec<Users>,
+    factors: Option<Vec<Density>>,
+    options: &Options,
+    progress: Progress<'_>,
+) -> Result<Vec<Sampled>, WorldError> {
     let done = std::sync::atomic::AtomicU64::new(0);
     let total = sets.len() as u64;
-    // Large meshes first, so that none is left for the end alone.
-    let mut sets: Vec<_> = sets.into_iter().collect();
-    sets.sort_by_key(|((mesh, _), _)| {
-        std::cmp::Reverse(scene.meshes[*mesh as usize].triangles.len())
-    });
     let mut sampled: Vec<Sampled> = sets
         .into_par_iter()
-        .map(|((mesh_index, _), users)| {
-            let mesh = &scene.meshes[mesh_index as usize];
-            let volume = |s: &Vec3| s.x * s.y * s.z;
-            let largest = users.iter().map(|(_, s)| *s).fold(Vec3::ZERO, |a, b| {
-                if volume(&b) > volume(&a) { b } else { a }
-            });
-            let set = generate(
-                mesh,
-                largest,
-                options.density,
-                options.seed.wrapping_add(u64::from(mesh_index)),
-            )?;
+        .enumerate()
+        .map(|(number, set)| {
+            let mesh = &scene.meshes[set.mesh as usize];
+            let largest = set.largest();
+            let seed = options.seed.wrapping_add(u64::from(set.mesh));
+            let points = match &factors {
+                Some(factors) => {
+                    generate_adaptive(mesh, largest, options.density, &factors[number], seed)?
+                }
+                None => generate(mesh, largest, options.density, seed)?,
+            };
             progress(
                 "points",
                 done.fetch_add(1, std::sync::atomic::Ordering::Relaxed) + 1,
                 total,
             );
             Ok(Sampled {
-                mesh: mesh_index,
-                users,
+                mesh: set.mesh,
+                users: set.users,
                 scale: largest,
-                points: set.points,
+                points: points.points,
             })
         })
         .collect::<Result<_, PointError>>()?;

@@ -7,14 +7,29 @@ use crate::cell::{Bucket, Cell};
 use crate::grid::Instance;
 use crate::point::{NORMALS, decode_position};
 
-/// Eq. 3: points whose normal differs more than this (as a dot product) do not count.
+/// Eq. 3: points whose normal differs more than this (as a dot product) do not count; for
+/// [`Kernel::Planar`] they count as if it were this much, so next to nothing beside others.
 pub const T_N: f32 = 0.1;
 
 /// Eq. 3: points that lie this much above or below their own plane do not count.
 pub const T_D: f32 = 0.7;
 
-/// Half-width of the plane band of [`Kernel::Planar`], in radii.
-pub const PLANE_BAND: f32 = 0.3;
+/// [`Kernel::Planar`]: squared distances from the planes count this much more than those along
+/// them.
+pub const FLATNESS: f32 = 11.0;
+
+/// [`Kernel::Planar`]: the squared distance, in radii, from which weights begin to fall.
+pub const CORE: f32 = 0.2;
+
+/// [`Kernel::Planar`]: how far before the block switches the cells fade that it will leave, in
+/// cells.
+pub const FADE: f32 = 0.3;
+
+/// [`Kernel::Planar`]: points less open than this count less, in proportion.
+pub const SEEN: f32 = 0.2;
+
+/// [`Kernel::Planar`]: what a point counts at least, however dark.
+pub const UNSEEN: f32 = 0.001;
 
 /// How the points around a fragment are weighted.
 #[repr(u8)]
@@ -22,8 +37,14 @@ pub const PLANE_BAND: f32 = 0.3;
 pub enum Kernel {
     /// The paper's, Eq. 2 to 4; 1 where no point counts.
     Paper = 0,
-    /// (1 − d²/r²) · max(0, 1 − (h/0.3r)²) · max(0, n·nₚ)⁸ with h = max(|n·d|, |nₚ·d|) and
-    /// n·nₚ > T_n; where no point counts, the nearest fetched point.
+    /// s · (min(1, 5o) + 0.001) · max(0.1, n·nₚ)⁸ / (0.2 + (d² + 11h²)/r²)² with
+    /// h = max(|n·d|, |nₚ·d|); 1 where no point was fetched.
+    ///
+    /// s is the part of the point's cell: along each axis it falls to 0 over the last 0.3 cells
+    /// before the block leaves the cell, so that the answer has no steps. A point of openness o
+    /// below 0.2 counts less, as hardly any fragment nearby can see it: such points lie inside of
+    /// solids or under what stands on their surface. Points that face elsewhere count next to
+    /// nothing, and so only where there is no other.
     #[default]
     Planar = 1,
 }
@@ -44,7 +65,7 @@ pub struct Lookup<'a> {
 pub struct Answer {
     /// 1 is open, 0 fully occluded. Never NaN.
     pub openness: f32,
-    /// Sum of the weights; 0 where no point counted (a hole).
+    /// Sum of the weights; 0 where no point counted (`Paper`: a hole).
     pub weight: f32,
     /// Points read.
     pub fetched: u32,
@@ -69,7 +90,7 @@ impl Lookup<'_> {
     ///
     /// `position`, `normal` (any length): in the instance's local space. Unknown instances,
     /// instances without points, positions outside the grid and non-finite input answer 1; a zero
-    /// normal agrees with no point, so `Paper` answers 1 and `Planar` the nearest point.
+    /// normal agrees with no point, so `Paper` answers 1 and `Planar` blends by distance alone.
     pub fn blend(&self, kernel: Kernel, instance: u32, position: Vec3, normal: Vec3) -> Answer {
         let Some(grid) = self.instances.get(instance as usize) else {
             return Answer::OPEN;
@@ -93,6 +114,7 @@ impl Lookup<'_> {
             place[axis] = g[axis] - lower;
         }
         let mut blend = Blend::new(kernel, grid.radius, normal);
+        let sides = place.map(sides);
         for corner in 0..8i32 {
             let offset = [corner & 1, corner >> 1 & 1, corner >> 2];
             // −1 becomes a large number: below the grid is out of range too.
@@ -104,7 +126,8 @@ impl Lookup<'_> {
                 continue;
             };
             let from = core::array::from_fn(|axis| offset[axis] as f32 - place[axis]);
-            blend.add_cell(found, from);
+            let side = (0..3).fold(1.0, |side, axis| side * sides[axis][offset[axis] as usize]);
+            blend.add_cell(found, from, side);
         }
         blend.answer()
     }
@@ -118,6 +141,12 @@ impl Lookup<'_> {
             (cell.key == key).then_some(cell)
         })
     }
+}
+
+/// How much the lower and the upper cells of a block count along an axis, for a fragment at this
+/// place in it: nothing once the block is about to leave them.
+fn sides(place: f32) -> [f32; 2] {
+    [1.5 - place, place - 0.5].map(|left| (left * (1.0 / FADE)).clamp(0.0, 1.0))
 }
 
 /// The fragment's unit normal in cell space; zero for a zero one, none for a non-finite one.
@@ -144,33 +173,28 @@ struct Blend {
     normal: Vec3,
     radius: f32,
     inverse_radius_squared: f32,
-    inverse_band_squared: f32,
     weight: f32,
     sum: f32,
     fetched: u32,
-    nearest: f32,
-    nearest_squared: f32,
 }
 
 impl Blend {
     fn new(kernel: Kernel, radius: f32, normal: Vec3) -> Blend {
-        let band = PLANE_BAND * radius;
         Blend {
             kernel,
             normal,
             radius,
-            inverse_radius_squared: 1.0 / (radius * radius),
-            inverse_band_squared: 1.0 / (band * band),
+            // Finite, so that a point right at the fragment is at distance 0 for any radius.
+            inverse_radius_squared: (1.0 / (radius * radius)).min(f32::MAX),
             weight: 0.0,
             sum: 0.0,
             fetched: 0,
-            nearest: 1.0,
-            nearest_squared: f32::INFINITY,
         }
     }
 
-    /// Adds a cell's points; `from` is the vector from the fragment to the cell's lower corner.
-    fn add_cell(&mut self, cell: &Cell, from: Vec3) {
+    /// Adds a cell's points; `from` is the vector from the fragment to the cell's lower corner,
+    /// `side` the cell's part.
+    fn add_cell(&mut self, cell: &Cell, from: Vec3, side: f32) {
         for point in cell.points() {
             let step = point.position();
             let d: Vec3 = core::array::from_fn(|axis| from[axis] + decode_position(step[axis]));
@@ -178,13 +202,12 @@ impl Blend {
             let openness = f32::from(point.occlusion()) * (1.0 / 255.0);
             let squared = dot(d, d);
             self.fetched += 1;
-            if squared < self.nearest_squared {
-                self.nearest_squared = squared;
-                self.nearest = openness;
-            }
             let weight = match self.kernel {
                 Kernel::Paper => self.paper(d, squared, point_normal),
-                Kernel::Planar => self.planar(d, squared, point_normal),
+                Kernel::Planar => {
+                    let seen = (openness * (1.0 / SEEN)).min(1.0) + UNSEEN;
+                    side * seen * self.planar(d, squared, point_normal)
+                }
             };
             self.weight += weight;
             self.sum += weight * openness;
@@ -203,25 +226,19 @@ impl Blend {
     }
 
     fn planar(&self, d: Vec3, squared: f32, point_normal: Vec3) -> f32 {
-        let agree = dot(point_normal, self.normal);
-        if agree <= T_N {
-            return 0.0;
-        }
+        let agree = dot(point_normal, self.normal).max(T_N);
         let h = dot(self.normal, d).abs().max(dot(point_normal, d).abs());
-        let near = (1.0 - squared * self.inverse_radius_squared).max(0.0);
-        let flat = (1.0 - h * h * self.inverse_band_squared).max(0.0);
+        let far = CORE + (squared + FLATNESS * (h * h)) * self.inverse_radius_squared;
         let agree2 = agree * agree;
         let agree4 = agree2 * agree2;
-        near * flat * agree4 * agree4
+        agree4 * agree4 / (far * far)
     }
 
-    /// Eq. 4, and the nearest point for a planar hole.
+    /// Eq. 4.
     fn answer(&self) -> Answer {
         let openness = if self.weight > 0.0 {
             // The quotient of two sums may round past the largest value blended.
             (self.sum / self.weight).min(1.0)
-        } else if self.kernel == Kernel::Planar {
-            self.nearest
         } else {
             1.0
         };
@@ -277,13 +294,52 @@ mod tests {
             let far = lookup.blend(kernel, 0, [3.5, 1.0, 1.5], [0.0, 1.0, 0.0]);
             assert_eq!((far.openness, far.fetched), (1.0, 0));
             let other_side = lookup.blend(kernel, 0, [1.4, 1.01, 1.6], [0.0, -1.0, 0.0]);
-            assert_eq!(other_side.weight, 0.0);
+            let alone = kernel == Kernel::Planar;
+            let expected = if alone { 0.2 } else { 1.0 };
+            assert!(
+                (other_side.openness - expected).abs() < 1e-6 && (other_side.weight > 0.0) == alone,
+                "{kernel:?} of a point that faces away: {other_side:?}"
+            );
         }
-        let hole = lookup.blend(Kernel::Planar, 0, [1.4, 1.01, 1.6], [0.0, -1.0, 0.0]);
-        assert!(
-            (hole.openness - 0.2).abs() < 1e-6,
-            "planar falls back to the nearest"
-        );
+    }
+
+    #[test]
+    fn planar_hides_what_faces_away_and_what_is_dark_behind_what_is_not() {
+        let down = Point::pack([16, 0, 16], encode_normal([0.0, -1.0, 0.0]), 10);
+        for other in [down, up(0)] {
+            let (grid, buckets, cells) = scene([1, 1, 1], &[other, up(204)]);
+            let lookup = Lookup {
+                instances: &[grid],
+                buckets: &buckets,
+                cells: &cells,
+            };
+            let both = lookup.blend(Kernel::Planar, 0, [1.4, 1.01, 1.6], [0.0, 1.0, 0.0]);
+            assert!((both.openness - 0.8).abs() < 1e-3, "{both:?}");
+        }
+    }
+
+    #[test]
+    fn planar_does_not_jump_where_the_block_leaves_a_cell() {
+        let (grid, buckets, cells) = scene([1, 1, 1], &[up(51)]);
+        let lookup = Lookup {
+            instances: &[grid],
+            buckets: &buckets,
+            cells: &cells,
+        };
+        let weight = |x| {
+            lookup
+                .blend(Kernel::Planar, 0, [x, 1.01, 1.6], [0.0, 1.0, 0.0])
+                .weight
+        };
+        let steps: [f32; 2001] = core::array::from_fn(|i| weight(0.4 + i as f32 * 1.1e-3));
+        let most = steps.iter().copied().fold(0.0, f32::max);
+        for pair in steps.windows(2) {
+            assert!(
+                (pair[1] - pair[0]).abs() < 0.01 * most,
+                "{pair:?} of {most}"
+            );
+        }
+        assert_eq!((steps[0], steps[2000]), (0.0, 0.0));
     }
 
     #[test]

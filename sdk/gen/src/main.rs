@@ -3,6 +3,7 @@
 
 mod header;
 mod install;
+mod shaders;
 
 use clap::{Parser, Subcommand};
 use std::path::{Path, PathBuf};
@@ -52,10 +53,9 @@ fn generated(root: &Path) -> Result<Vec<(&'static str, String)>, String> {
         .iter()
         .map(|name| format!("{name}\n"))
         .collect();
-    Ok(vec![
-        ("include/psao.h", header),
-        ("sdk/ffi/exports.txt", exports),
-    ])
+    let mut files = vec![("include/psao.h", header), ("sdk/ffi/exports.txt", exports)];
+    files.extend(shaders::generate(root)?);
+    Ok(files)
 }
 
 fn settle(root: &Path, files: &[(&str, String)], check: bool) -> Result<(), String> {

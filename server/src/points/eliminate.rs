@@ -19,6 +19,8 @@ pub(super) struct Sample {
     pub position: [f32; 3],
     /// Unit normal times 127.
     pub normal: [i8; 3],
+    /// Distances count as so many times longer: where it is above 1 points lie denser.
+    pub stretch: f32,
 }
 
 /// What became of the samples, by index.
@@ -46,7 +48,8 @@ const FACING: i32 = 127 * 127 / 10;
 /// Takes samples away until `keep` are left, spread as evenly as samples closer than `reach`
 /// metres (twice the largest Poisson radius at the density to come) can tell.
 pub(super) fn eliminate(samples: &[Sample], reach: f32, keep: usize) -> Eliminated {
-    let (cells, order) = sort_into_cells(samples, reach);
+    let least = samples.iter().map(|s| s.stretch).fold(1.0, f32::min);
+    let (cells, order) = sort_into_cells(samples, reach / least);
     let sorted: Vec<Sample> = order.par_iter().map(|&i| samples[i as usize]).collect();
     let mut graph = Graph::new(&sorted, &cells, reach, keep);
     drop(cells);
@@ -161,6 +164,8 @@ impl Weigh {
         let facing: i32 = (0..3)
             .map(|k| i32::from(a.normal[k]) * i32::from(b.normal[k]))
             .sum();
+        let stretch = 0.5 * (a.stretch + b.stretch);
+        let d2 = d2 * (stretch * stretch);
         if d2 >= self.reach * self.reach || facing <= FACING {
             return None;
         }

@@ -17,7 +17,7 @@ use super::lanes::Lanes;
 
 /// For trees that are built once and traced often. On Sponza, dearer builds than this trace no
 /// faster.
-const STATIC: BvhBuildParams = BvhBuildParams::fast_build();
+pub(super) const STATIC: BvhBuildParams = BvhBuildParams::fast_build();
 /// For the tree over movers, built every frame.
 pub(super) const TOP: BvhBuildParams = BvhBuildParams::fastest_build();
 
@@ -177,6 +177,17 @@ fn padding(corners: &[Corners]) -> f32 {
 
 fn padded(bounds: Aabb, by: Vec3A) -> Aabb {
     Aabb::new(bounds.min - by, bounds.max + by)
+}
+
+/// Boxes of triangles, enlarged for rounding. Corners that make no triangle become zero.
+#[cfg(feature = "gpu")]
+pub(super) fn sane_boxes(triangles: &mut [[Vec3; 3]]) -> Vec<Aabb> {
+    let corners: Vec<Corners> = triangles.iter().map(|t| Corners::new(*t)).collect();
+    for (triangle, sane) in triangles.iter_mut().zip(&corners) {
+        *triangle = std::array::from_fn(|i| Vec3::new(sane.x[i], sane.y[i], sane.z[i]));
+    }
+    let pad = Vec3A::splat(padding(&corners));
+    corners.iter().map(|c| padded(c.bounds(), pad)).collect()
 }
 
 /// A number that looks random, for 32 bits that don't.

@@ -15,6 +15,8 @@ mod tests;
 use std::fmt;
 
 use glam::{Affine3A, DAffine3, Mat3A, Vec2, Vec3, Vec3A};
+#[cfg(feature = "gpu")]
+use obvhs::cwbvh::{CwBvh, bvh2_to_cwbvh::bvh2_to_cwbvh};
 use obvhs::{aabb::Aabb, bvh2::Bvh2, ray::Ray};
 use rayon::prelude::*;
 
@@ -166,6 +168,38 @@ fn inverse(world_from_local: &Affine3A) -> Option<Mat3A> {
     let inverse = double.matrix3.inverse().as_mat3();
     let usable = world_from_local.is_finite() && inverse.is_finite();
     (usable && double.matrix3.determinant() != 0.0).then(|| Mat3A::from(inverse))
+}
+
+/// Whether an instance placed so can be hit.
+#[cfg(feature = "gpu")]
+pub(crate) fn is_placed(world_from_local: &Affine3A) -> bool {
+    inverse(world_from_local).is_some()
+}
+
+/// A tree with eight boxes a node over triangles in world space, as a GPU walks it, and its depth.
+/// Corners that make no triangle become zero, and a triangle alone is put there twice.
+#[cfg(feature = "gpu")]
+pub(crate) fn wide_tree(corners: &mut Vec<[Vec3; 3]>) -> (CwBvh, usize) {
+    if let [alone] = corners[..] {
+        corners.push(alone);
+    }
+    let mut boxes = body::sane_boxes(corners);
+    let tree = bvh2_to_cwbvh(&body::tree(&mut boxes, &body::STATIC), 3, true, false);
+    let mut depth = 0;
+    let mut level = if tree.nodes.is_empty() {
+        vec![]
+    } else {
+        vec![0]
+    };
+    while !level.is_empty() {
+        depth += 1;
+        let inner = |node: &u32| {
+            let node = &tree.nodes[*node as usize];
+            node.child_base_idx..node.child_base_idx + node.imask.count_ones()
+        };
+        level = level.iter().flat_map(inner).collect();
+    }
+    (tree, depth)
 }
 
 /// Traces on the CPU, with trees from `obvhs`.

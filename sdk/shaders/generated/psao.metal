@@ -1,0 +1,645 @@
+// PSAO: the lookup, to paste into a shader. Blends the points around a fragment into its openness:
+// 1 is open, 0 fully occluded. Multiply ambient light with it.
+// Generated from sdk/shaders/psao.wgsl by psao-gen: do not edit. Its comments say how it works.
+//
+// Call one of these, from any stage. The stream's header says which kernel its points are for.
+//     float psao_planar_fast(uint instance, vec3 position, vec3 normal)   planar, the quicker way
+//     float psao_planar(uint instance, vec3 position, vec3 normal)        planar, written plainly
+//     float psao_paper(uint instance, vec3 position, vec3 normal)
+// The first is quicker only if the buckets have tags: docs/gpu.md says how to put them there.
+// instance: index into the instance buffer, below its capacity.
+// position: in the instance's local space (rest space where it is skinned or morphed). It must come
+//     from the vertices' own positions, as a varying. Never subtract it from a world position: f32
+//     does not hold both far from the origin.
+// normal: in the same space, of any length, on the side of the surface that is seen.
+// Position and normal have to be finite, and of full precision (highp).
+//
+// Metal shading language 2.0. Reads device buffers: bind the client's instances, buckets and cells,
+// as they are, to any buffer slots, and pass the three on, behind the arguments above and in this
+// order; each function shows it. vec3 is metal::float3.
+
+// language: metal2.0
+#include <metal_stdlib>
+#include <simd/simd.h>
+
+using metal::uint;
+
+typedef metal::uint4 PsaoWords[1];
+struct PsaoGrid {
+    metal::packed_float3 origin;
+    float radius;
+    metal::packed_float3 cells_per_unit;
+    uint bucket_first;
+    metal::packed_uint3 dims;
+    uint bucket_count;
+    metal::float3 normal_scale;
+};
+struct PsaoFragment {
+    metal::int3 base;
+    metal::float3 place;
+    metal::packed_float3 normal;
+    bool outside;
+    char _pad4[3];
+};
+struct PsaoCandidate {
+    uint cell;
+    bool unsure;
+    char _pad2[3];
+};
+constant float PSAO_T_N = 0.1;
+constant float PSAO_T_D = 0.7;
+constant float PSAO_FLATNESS = 11.0;
+constant float PSAO_CORE = 0.2;
+constant float PSAO_FADE = 0.3;
+constant float PSAO_SEEN = 0.2;
+constant float PSAO_UNSEEN = 0.001;
+constant uint PSAO_ENTRY_CELL = 4194303u;
+
+metal::uint4 psao_load_instance(
+    uint index,
+    device PsaoWords const& psao_instances
+) {
+    metal::uint4 _e3 = psao_instances[index];
+    return _e3;
+}
+
+metal::uint4 psao_load_bucket(
+    uint index_1,
+    device PsaoWords const& psao_buckets
+) {
+    metal::uint4 _e3 = psao_buckets[index_1];
+    return _e3;
+}
+
+metal::uint4 psao_load_cell(
+    uint index_2,
+    device PsaoWords const& psao_cells
+) {
+    metal::uint4 _e3 = psao_cells[index_2];
+    return _e3;
+}
+
+PsaoGrid psao_grid(
+    uint instance_1,
+    device PsaoWords const& psao_instances
+) {
+    metal::uint4 _e3 = psao_load_instance(instance_1 * 4u, psao_instances);
+    metal::uint4 _e8 = psao_load_instance((instance_1 * 4u) + 1u, psao_instances);
+    metal::uint4 _e13 = psao_load_instance((instance_1 * 4u) + 2u, psao_instances);
+    metal::uint4 _e18 = psao_load_instance((instance_1 * 4u) + 3u, psao_instances);
+    return PsaoGrid {as_type<metal::float3>(_e3.xyz), as_type<float>(_e3.w), as_type<metal::float3>(_e8.xyz), _e8.w, _e13.xyz, _e13.w, as_type<metal::float3>(_e18.xyz)};
+}
+
+metal::int3 psao_naga_f2i32(metal::float3 value) {
+    return static_cast<metal::int3>(metal::clamp(value, -2147483600.0, 2147483500.0));
+}
+
+PsaoFragment psao_fragment(
+    PsaoGrid grid,
+    metal::float3 position_1,
+    metal::float3 normal_1
+) {
+    bool local = {};
+    bool local_1 = {};
+    metal::float3 g = (position_1 - grid.origin) * grid.cells_per_unit;
+    if (metal::all(g >= metal::float3(-0.5))) {
+        local = metal::all(g < (static_cast<metal::float3>(grid.dims) + metal::float3(0.5)));
+    } else {
+        local = false;
+    }
+    bool inside = local;
+    metal::float3 lower = metal::floor(metal::clamp(g, metal::float3(-0.5), static_cast<metal::float3>(grid.dims) + metal::float3(0.5)) - metal::float3(0.5));
+    float largest = metal::max(metal::max(metal::abs(normal_1.x), metal::abs(normal_1.y)), metal::abs(normal_1.z));
+    metal::float3 n = (normal_1 / metal::float3(metal::max(largest, 0.0000000000000000000000000000000000001))) * grid.normal_scale;
+    float squared = metal::dot(n, n);
+    if (!((grid.bucket_count == 0u))) {
+        local_1 = !(inside);
+    } else {
+        local_1 = true;
+    }
+    bool _e65 = local_1;
+    return PsaoFragment {psao_naga_f2i32(lower), g - lower, n * ((squared > 0.0) ? metal::rsqrt(squared) : 0.0), _e65};
+}
+
+uint psao_weigh(
+    PsaoGrid grid_1,
+    metal::uint3 cell,
+    uint weight_y,
+    uint weight_z
+) {
+    return (cell.x + ((cell.y * grid_1.dims[0]) * weight_y)) + ((cell.z * (grid_1.dims[0] * grid_1.dims[1])) * weight_z);
+}
+
+uint psao_naga_mod(uint lhs, uint rhs) {
+    return lhs % metal::select(rhs, 1u, rhs == 0u);
+}
+
+uint psao_find(
+    PsaoGrid grid_2,
+    metal::uint3 cell_1,
+    device PsaoWords const& psao_buckets,
+    device PsaoWords const& psao_cells
+) {
+    uint i = 0u;
+    uint _e4 = psao_weigh(grid_2, cell_1, 1u, 1u);
+    uint _e8 = psao_weigh(grid_2, cell_1, 17u, 31u);
+    uint bucket = grid_2.bucket_first + psao_naga_mod(_e8, grid_2.bucket_count);
+    bool loop_init = true;
+    while(true) {
+        if (!loop_init) {
+            uint _e37 = i;
+            i = _e37 + 1u;
+        }
+        loop_init = false;
+        uint _e14 = i;
+        if (_e14 < 8u) {
+        } else {
+            break;
+        }
+        {
+            uint _e19 = i;
+            metal::uint4 _e23 = psao_load_bucket((bucket * 2u) + (_e19 >> 2u), psao_buckets);
+            uint _e24 = i;
+            uint entry = _e23[_e24 & 3u] & PSAO_ENTRY_CELL;
+            if (entry == 0u) {
+                break;
+            }
+            metal::uint4 _e34 = psao_load_cell(entry * 2u, psao_cells);
+            if (_e34.x == _e4) {
+                return entry;
+            }
+        }
+    }
+    return 0u;
+}
+
+metal::float3 psao_point_place(
+    uint point
+) {
+    metal::uint3 steps = metal::uint3(point >> 16u, point >> 21u, point >> 26u) & metal::uint3(31u);
+    return (static_cast<metal::float3>(steps) + metal::float3(0.5)) * 0.03125;
+}
+
+metal::float3 psao_point_normal(
+    uint point_1
+) {
+    metal::uint2 codes = metal::uint2(point_1 >> 8u, point_1 >> 12u) & metal::uint2(15u);
+    metal::float2 uv = (static_cast<metal::float2>(metal::min(codes, metal::uint2(14u))) - metal::float2(7.0)) / metal::float2(7.0);
+    float z = (1.0 - metal::abs(uv.x)) - metal::abs(uv.y);
+    metal::float2 folded = (metal::float2(1.0) - metal::abs(uv.yx)) * metal::select(metal::float2(1.0), metal::float2(-1.0), uv < metal::float2(0.0));
+    return metal::normalize(metal::float3((z >= 0.0) ? uv : folded, z));
+}
+
+float psao_point_openness(
+    uint point_2
+) {
+    return static_cast<float>(point_2 & 255u) * 0.003921569;
+}
+
+float psao_paper_weight(
+    float radius,
+    metal::float3 normal_2,
+    metal::float3 d,
+    metal::float3 point_normal
+) {
+    bool local_2 = {};
+    bool local_3 = {};
+    float squared_1 = metal::dot(d, d);
+    float along = metal::dot(point_normal, d);
+    if (!((metal::dot(point_normal, normal_2) <= PSAO_T_N))) {
+        if ((along * along) >= (PSAO_T_D * squared_1)) {
+            local_3 = squared_1 > 0.0;
+        } else {
+            local_3 = false;
+        }
+        bool _e21 = local_3;
+        local_2 = _e21;
+    } else {
+        local_2 = true;
+    }
+    bool _e23 = local_2;
+    if (_e23) {
+        return 0.0;
+    }
+    return metal::max((radius - metal::sqrt(squared_1)) / radius, 0.0);
+}
+
+float psao_planar_weight(
+    float radius_1,
+    metal::float3 normal_3,
+    metal::float3 d_1,
+    metal::float3 point_normal_1
+) {
+    float agree = metal::max(metal::dot(point_normal_1, normal_3), PSAO_T_N);
+    float h = metal::max(metal::abs(metal::dot(normal_3, d_1)), metal::abs(metal::dot(point_normal_1, d_1)));
+    float apart = PSAO_CORE + ((metal::dot(d_1, d_1) + (PSAO_FLATNESS * (h * h))) / (radius_1 * radius_1));
+    float agree2_ = agree * agree;
+    float agree4_ = agree2_ * agree2_;
+    return (agree4_ * agree4_) / (apart * apart);
+}
+
+float psao_side(
+    metal::float3 place,
+    metal::uint3 offset
+) {
+    metal::float3 left_1 = metal::select(metal::float3(1.5) - place, place - metal::float3(0.5), offset != metal::uint3(0u));
+    metal::float3 sides = metal::clamp(left_1 / metal::float3(0.3), metal::float3(0.0), metal::float3(1.0));
+    return (sides.x * sides.y) * sides.z;
+}
+
+float psao_blend(
+    bool planar,
+    uint instance_2,
+    metal::float3 position_2,
+    metal::float3 normal_4,
+    device PsaoWords const& psao_instances,
+    device PsaoWords const& psao_buckets,
+    device PsaoWords const& psao_cells
+) {
+    float weights = 0.0;
+    float sum = 0.0;
+    uint corner = 0u;
+    uint i_1 = {};
+    float weight = {};
+    PsaoGrid _e4 = psao_grid(instance_2, psao_instances);
+    PsaoFragment _e5 = psao_fragment(_e4, position_2, normal_4);
+    if (_e5.outside) {
+        return 1.0;
+    }
+    bool loop_init_1 = true;
+    while(true) {
+        if (!loop_init_1) {
+            uint _e92 = corner;
+            corner = _e92 + 1u;
+        }
+        loop_init_1 = false;
+        uint _e14 = corner;
+        if (_e14 < 8u) {
+        } else {
+            break;
+        }
+        {
+            uint _e17 = corner;
+            uint _e18 = corner;
+            uint _e21 = corner;
+            metal::uint3 offset_1 = metal::uint3(_e17, _e18 >> 1u, _e21 >> 2u) & metal::uint3(1u);
+            metal::uint3 cell_3 = static_cast<metal::uint3>(_e5.base) + offset_1;
+            if (metal::any(cell_3 >= _e4.dims)) {
+                continue;
+            }
+            uint _e34 = psao_find(_e4, cell_3, psao_buckets, psao_cells);
+            if (_e34 == 0u) {
+                continue;
+            }
+            metal::float3 corner_from = static_cast<metal::float3>(offset_1) - _e5.place;
+            float _e41 = psao_side(_e5.place, offset_1);
+            i_1 = 1u;
+            bool loop_init_2 = true;
+            while(true) {
+                if (!loop_init_2) {
+                    uint _e89 = i_1;
+                    i_1 = _e89 + 1u;
+                }
+                loop_init_2 = false;
+                uint _e44 = i_1;
+                if (_e44 < 8u) {
+                } else {
+                    break;
+                }
+                {
+                    uint _e49 = i_1;
+                    metal::uint4 _e53 = psao_load_cell((_e34 * 2u) + (_e49 >> 2u), psao_cells);
+                    uint _e54 = i_1;
+                    uint point_4 = _e53[_e54 & 3u];
+                    if (point_4 == 0u) {
+                        break;
+                    }
+                    if (point_4 < 2147483648u) {
+                        continue;
+                    }
+                    metal::float3 _e62 = psao_point_place(point_4);
+                    metal::float3 d_2 = corner_from + _e62;
+                    metal::float3 _e64 = psao_point_normal(point_4);
+                    float _e65 = psao_point_openness(point_4);
+                    weight = 0.0;
+                    if (planar) {
+                        float seen = metal::min(_e65 / PSAO_SEEN, 1.0) + PSAO_UNSEEN;
+                        float _e77 = psao_planar_weight(_e4.radius, _e5.normal, d_2, _e64);
+                        weight = (_e41 * seen) * _e77;
+                    } else {
+                        float _e81 = psao_paper_weight(_e4.radius, _e5.normal, d_2, _e64);
+                        weight = _e81;
+                    }
+                    float _e82 = weights;
+                    float _e83 = weight;
+                    weights = _e82 + _e83;
+                    float _e85 = sum;
+                    float _e86 = weight;
+                    sum = _e85 + (_e86 * _e65);
+                }
+            }
+        }
+    }
+    float _e95 = weights;
+    if (_e95 > 0.0) {
+        float _e98 = sum;
+        float _e99 = weights;
+        return metal::min(_e98 / _e99, 1.0);
+    }
+    return 1.0;
+}
+
+float psao_planar(
+    uint instance_3,
+    metal::float3 position_3,
+    metal::float3 normal_5,
+    device PsaoWords const& psao_instances,
+    device PsaoWords const& psao_buckets,
+    device PsaoWords const& psao_cells
+) {
+    float _e4 = psao_blend(true, instance_3, position_3, normal_5, psao_instances, psao_buckets, psao_cells);
+    return _e4;
+}
+
+float psao_paper(
+    uint instance_4,
+    metal::float3 position_4,
+    metal::float3 normal_6,
+    device PsaoWords const& psao_instances,
+    device PsaoWords const& psao_buckets,
+    device PsaoWords const& psao_cells
+) {
+    float _e4 = psao_blend(false, instance_4, position_4, normal_6, psao_instances, psao_buckets, psao_cells);
+    return _e4;
+}
+
+uint psao_tag(
+    uint key
+) {
+    return metal::max((key * 2654435761u) >> 22u, 1u);
+}
+
+uint psao_naga_f2u32(float value) {
+    return static_cast<uint>(metal::clamp(value, 0.0, 4294967000.0));
+}
+
+uint psao_modulo(
+    uint hash,
+    uint count,
+    float inverse
+) {
+    uint left_2 = hash - (psao_naga_f2u32((static_cast<float>(hash) * inverse) * 0.999999) * count);
+    uint rest = left_2 - (psao_naga_f2u32(static_cast<float>(left_2) * inverse) * count);
+    uint raised = (rest >= 2147483648u) ? (rest + count) : rest;
+    return (raised >= count) ? (raised - count) : raised;
+}
+
+void psao_add(
+    thread metal::float2& sums,
+    float inverse_radius2_,
+    metal::float3 normal_7,
+    metal::float3 place_1,
+    float side,
+    uint point_3
+) {
+    metal::int3 steps_1 = static_cast<metal::int3>(metal::uint3(point_3) & metal::uint3(2031616u, 65011712u, 2080374784u));
+    metal::float3 scale = metal::float3(0.00000047683716, 0.000000014901161, 0.0000000004656613);
+    metal::float3 d_3 = (static_cast<metal::float3>(steps_1) * scale) - place_1;
+    metal::int2 codes_1 = static_cast<metal::int2>(metal::uint2(point_3 >> 8u, point_3 >> 12u) & metal::uint2(15u));
+    metal::float2 uv_1 = static_cast<metal::float2>(metal::min(codes_1, metal::int2(14))) - metal::float2(7.0);
+    float z_1 = (7.0 - metal::abs(uv_1.x)) - metal::abs(uv_1.y);
+    float fold = metal::max(-(z_1), 0.0);
+    metal::float3 m = metal::float3(uv_1 - metal::select(metal::float2(fold), metal::float2(-(fold)), uv_1 < metal::float2(0.0)), z_1);
+    float inverse_1 = 1.0 / metal::dot(m, m);
+    float agree_1 = metal::max(metal::dot(m, normal_7), 0.0);
+    float agree2_1 = metal::max((agree_1 * agree_1) * inverse_1, 0.010000001);
+    float along_1 = metal::dot(normal_7, d_3);
+    float point_along = metal::dot(m, d_3);
+    float h2_ = metal::max(along_1 * along_1, (point_along * point_along) * inverse_1);
+    float apart_1 = PSAO_CORE + ((metal::dot(d_3, d_3) + (PSAO_FLATNESS * h2_)) * inverse_radius2_);
+    float openness = static_cast<float>(static_cast<int>(point_3 & 255u));
+    float seen_1 = metal::min(openness * 0.019607844, 1.0) + PSAO_UNSEEN;
+    float agree4_1 = agree2_1 * agree2_1;
+    float weight_1 = (((side * seen_1) * agree4_1) * agree4_1) / (apart_1 * apart_1);
+    metal::float2 _e94 = sums;
+    sums = _e94 + (((point_3 >= 2147483648u) ? weight_1 : 0.0) * metal::float2(1.0, openness));
+    return;
+}
+
+PsaoCandidate psao_pick(
+    metal::uint4 entries,
+    uint tag
+) {
+    metal::uint4 tags = entries >> metal::uint4(22u);
+    metal::bool4 may = (tags == metal::uint4(tag)) | (tags == metal::uint4(0u));
+    metal::uint4 cells = (entries & metal::uint4(4194303u)) & (metal::uint4(0u) - static_cast<metal::uint4>(may));
+    uint sum_1 = ((cells.x + cells.y) + cells.z) + cells.w;
+    return PsaoCandidate {sum_1, sum_1 != metal::max(metal::max(cells.x, cells.y), metal::max(cells.z, cells.w))};
+}
+
+PsaoCandidate psao_candidate(
+    PsaoGrid grid_3,
+    float inverse_count,
+    metal::uint3 cell_2,
+    device PsaoWords const& psao_buckets
+) {
+    bool local_4 = {};
+    bool local_5 = {};
+    bool local_6 = {};
+    if (metal::any(cell_2 >= grid_3.dims)) {
+        return PsaoCandidate {0u, false};
+    }
+    uint _e11 = psao_weigh(grid_3, cell_2, 1u, 1u);
+    uint _e12 = psao_tag(_e11);
+    uint _e15 = psao_weigh(grid_3, cell_2, 17u, 31u);
+    uint _e18 = psao_modulo(_e15, grid_3.bucket_count, inverse_count);
+    uint bucket_1 = grid_3.bucket_first + _e18;
+    metal::uint4 _e22 = psao_load_bucket(bucket_1 * 2u, psao_buckets);
+    PsaoCandidate _e23 = psao_pick(_e22, _e12);
+    if (_e22.w == 0u) {
+        return _e23;
+    }
+    metal::uint4 _e31 = psao_load_bucket((bucket_1 * 2u) + 1u, psao_buckets);
+    PsaoCandidate _e32 = psao_pick(_e31, _e12);
+    if (_e23.cell != 0u) {
+        local_4 = _e32.cell != 0u;
+    } else {
+        local_4 = false;
+    }
+    bool both = local_4;
+    if (!(_e23.unsure)) {
+        local_5 = _e32.unsure;
+    } else {
+        local_5 = true;
+    }
+    bool _e52 = local_5;
+    if (!(_e52)) {
+        local_6 = both;
+    } else {
+        local_6 = true;
+    }
+    bool _e57 = local_6;
+    return PsaoCandidate {_e23.cell + _e32.cell, _e57};
+}
+
+float psao_planar_fast(
+    uint instance_5,
+    metal::float3 position_5,
+    metal::float3 normal_8,
+    device PsaoWords const& psao_instances,
+    device PsaoWords const& psao_buckets,
+    device PsaoWords const& psao_cells
+) {
+    bool local_7 = {};
+    bool local_8 = {};
+    bool local_9 = {};
+    bool local_10 = {};
+    bool local_11 = {};
+    bool local_12 = {};
+    bool local_13 = {};
+    uint left = {};
+    metal::float2 sums_1 = metal::float2(0.0);
+    bool second = false;
+    metal::uint4 words = {};
+    bool local_14 = {};
+    bool local_15 = {};
+    bool local_16 = {};
+    PsaoGrid _e3 = psao_grid(instance_5, psao_instances);
+    PsaoFragment _e4 = psao_fragment(_e3, position_5, normal_8);
+    if (_e4.outside) {
+        return 1.0;
+    }
+    float inverse_count_1 = 1.0 / static_cast<float>(_e3.bucket_count);
+    metal::uint3 base = static_cast<metal::uint3>(_e4.base);
+    PsaoCandidate _e13 = psao_candidate(_e3, inverse_count_1, base, psao_buckets);
+    PsaoCandidate _e19 = psao_candidate(_e3, inverse_count_1, base + metal::uint3(1u, 0u, 0u), psao_buckets);
+    PsaoCandidate _e25 = psao_candidate(_e3, inverse_count_1, base + metal::uint3(0u, 1u, 0u), psao_buckets);
+    PsaoCandidate _e31 = psao_candidate(_e3, inverse_count_1, base + metal::uint3(1u, 1u, 0u), psao_buckets);
+    PsaoCandidate _e37 = psao_candidate(_e3, inverse_count_1, base + metal::uint3(0u, 0u, 1u), psao_buckets);
+    PsaoCandidate _e43 = psao_candidate(_e3, inverse_count_1, base + metal::uint3(1u, 0u, 1u), psao_buckets);
+    PsaoCandidate _e49 = psao_candidate(_e3, inverse_count_1, base + metal::uint3(0u, 1u, 1u), psao_buckets);
+    PsaoCandidate _e55 = psao_candidate(_e3, inverse_count_1, base + metal::uint3(1u, 1u, 1u), psao_buckets);
+    if (!(_e13.unsure)) {
+        local_7 = _e19.unsure;
+    } else {
+        local_7 = true;
+    }
+    bool _e62 = local_7;
+    if (!(_e62)) {
+        local_8 = _e25.unsure;
+    } else {
+        local_8 = true;
+    }
+    bool _e68 = local_8;
+    if (!(_e68)) {
+        local_9 = _e31.unsure;
+    } else {
+        local_9 = true;
+    }
+    bool _e74 = local_9;
+    if (!(_e74)) {
+        local_10 = _e37.unsure;
+    } else {
+        local_10 = true;
+    }
+    bool _e80 = local_10;
+    if (!(_e80)) {
+        local_11 = _e43.unsure;
+    } else {
+        local_11 = true;
+    }
+    bool _e86 = local_11;
+    if (!(_e86)) {
+        local_12 = _e49.unsure;
+    } else {
+        local_12 = true;
+    }
+    bool _e92 = local_12;
+    if (!(_e92)) {
+        local_13 = _e55.unsure;
+    } else {
+        local_13 = true;
+    }
+    bool _e98 = local_13;
+    if (_e98) {
+        float _e99 = psao_planar(instance_5, position_5, normal_8, psao_instances, psao_buckets, psao_cells);
+        return _e99;
+    }
+    left = ((((((((_e13.cell != 0u) ? 1u : 0u) | ((_e19.cell != 0u) ? 2u : 0u)) | ((_e25.cell != 0u) ? 4u : 0u)) | ((_e31.cell != 0u) ? 8u : 0u)) | ((_e37.cell != 0u) ? 16u : 0u)) | ((_e43.cell != 0u) ? 32u : 0u)) | ((_e49.cell != 0u) ? 64u : 0u)) | ((_e55.cell != 0u) ? 128u : 0u);
+    float inverse_radius2_1 = 1.0 / (_e3.radius * _e3.radius);
+    while(true) {
+        uint _e166 = left;
+        if (_e166 != 0u) {
+        } else {
+            break;
+        }
+        {
+            uint _e169 = left;
+            uint _e171 = left;
+            uint corner_1 = (as_type<uint>(static_cast<float>(static_cast<int>(_e169 & (0u - _e171)))) >> 23u) - 127u;
+            metal::uint3 offset_2 = metal::uint3(corner_1, corner_1 >> 1u, corner_1 >> 2u) & metal::uint3(1u);
+            bool right = offset_2.x != 0u;
+            bool back = offset_2.y != 0u;
+            uint lower_1 = back ? (right ? _e31.cell : _e25.cell) : (right ? _e19.cell : _e13.cell);
+            uint upper = back ? (right ? _e55.cell : _e49.cell) : (right ? _e43.cell : _e37.cell);
+            uint found = (offset_2.z != 0u) ? upper : lower_1;
+            bool _e217 = second;
+            metal::uint4 _e220 = psao_load_cell((found * 2u) + (_e217 ? 1u : 0u), psao_cells);
+            words = _e220;
+            bool _e222 = second;
+            if (!(_e222)) {
+                uint _e227 = words.x;
+                uint _e231 = psao_weigh(_e3, base + offset_2, 1u, 1u);
+                local_14 = _e227 != _e231;
+            } else {
+                local_14 = false;
+            }
+            bool _e234 = local_14;
+            if (_e234) {
+                words = metal::uint4(0u);
+            }
+            uint _e239 = words.x;
+            bool _e240 = second;
+            uint a = _e240 ? _e239 : 0u;
+            uint _e243 = words.y;
+            bool _e245 = second;
+            if (_e245) {
+                local_15 = a == 0u;
+            } else {
+                local_15 = false;
+            }
+            bool _e251 = local_15;
+            uint b = _e251 ? 0u : _e243;
+            uint _e255 = words.z;
+            uint c = (b != 0u) ? _e255 : 0u;
+            uint _e261 = words.w;
+            uint d_4 = (c != 0u) ? _e261 : 0u;
+            float _e266 = psao_side(_e4.place, offset_2);
+            metal::float3 place_2 = (_e4.place - metal::float3(0.015625)) - static_cast<metal::float3>(static_cast<metal::int3>(offset_2));
+            bool _e274 = second;
+            if (_e274) {
+                psao_add(sums_1, inverse_radius2_1, _e4.normal, place_2, _e266, a);
+            }
+            psao_add(sums_1, inverse_radius2_1, _e4.normal, place_2, _e266, b);
+            psao_add(sums_1, inverse_radius2_1, _e4.normal, place_2, _e266, c);
+            psao_add(sums_1, inverse_radius2_1, _e4.normal, place_2, _e266, d_4);
+            bool _e279 = second;
+            if (!(_e279)) {
+                local_16 = d_4 != 0u;
+            } else {
+                local_16 = false;
+            }
+            bool _e286 = local_16;
+            second = _e286;
+            uint _e287 = left;
+            uint _e288 = left;
+            uint _e292 = left;
+            bool _e293 = second;
+            left = _e293 ? _e292 : (_e287 & (_e288 - 1u));
+        }
+    }
+    float _e296 = sums_1.y;
+    float _e298 = sums_1.x;
+    float _e305 = sums_1.x;
+    return (_e305 > 0.0) ? metal::min((_e296 / _e298) * 0.003921569, 1.0) : 1.0;
+}

@@ -1,0 +1,261 @@
+// Rays through obvhs' compressed wide trees (Ylitie et al. 2017), uploaded as they are: a node is
+// five vectors. Two trees: what stands still, and what moves.
+
+struct Trees {
+    // Nodes of the first tree, and of the second; triangles before the second's.
+    fixed_nodes: u32,
+    moving_nodes: u32,
+    fixed_triangles: u32,
+    // Rays in all; or rays a pixel, and which of its set is the first.
+    rays: u32,
+    first: u32,
+    t_max: f32,
+    unused_a: u32,
+    unused_b: u32,
+}
+
+@group(0) @binding(0) var<uniform> trees: Trees;
+@group(0) @binding(1) var<storage, read> nodes: array<vec4<u32>>;
+// Three corners each; in w: 0 or one more than the mask's index, and where its corners' texture
+// coordinates are.
+@group(0) @binding(2) var<storage, read> triangles: array<vec4<f32>>;
+@group(0) @binding(3) var<storage, read> uvs: array<vec2<f32>>;
+@group(0) @binding(4) var<storage, read> masks: array<Mask>;
+@group(0) @binding(5) var<storage, read> alpha: array<u32>;
+
+// Tree depth is checked when it is built.
+const STACK: u32 = 32u;
+
+fn is_hole(triangle: u32, u: f32, v: f32) -> bool {
+    let index = bitcast<u32>(triangles[triangle * 3u].w);
+    if index == 0u {
+        return false;
+    }
+    let first = bitcast<u32>(triangles[triangle * 3u + 1u].w);
+    let at = uvs[first] * (1.0 - u - v) + uvs[first + 1u] * u + uvs[first + 2u] * v;
+    let mask = masks[index - 1u];
+    let texel = mask.first + texel_at(at.y, mask.height, mask.wrap_v) * mask.width
+        + texel_at(at.x, mask.width, mask.wrap_u);
+    let value = (alpha[texel / 4u] >> (texel % 4u * 8u)) & 255u;
+    return f32(value) / 255.0 < mask.cutoff;
+}
+
+// As the processor's test (rays/body.rs): what tells the sides of an edge comes from its ends
+// alone, so no ray slips through between two triangles.
+fn is_hit(triangle: u32, origin: vec3<f32>, direction: vec3<f32>, t_max: f32) -> bool {
+    let a = triangles[triangle * 3u].xyz - origin;
+    let b = triangles[triangle * 3u + 1u].xyz - origin;
+    let c = triangles[triangle * 3u + 2u].xyz - origin;
+    let sides = vec3(
+        dot(cross(c - b, c + b), direction),
+        dot(cross(a - c, a + c), direction),
+        dot(cross(b - a, b + a), direction),
+    );
+    if !(all(sides >= vec3(0.0)) || all(sides <= vec3(0.0))) {
+        return false;
+    }
+    let normal = cross(b - a, c - a);
+    let t = dot(normal, a) / dot(normal, direction);
+    let sum = sides.x + sides.y + sides.z;
+    if !(t > 0.0 && t < t_max && sum != 0.0) {
+        return false;
+    }
+    return !is_hole(triangle, sides.y / sum, sides.z / sum);
+}
+
+// Bits of the children whose boxes a ray meets: inner nodes in the high 8, in the order they are
+// to be walked in, triangles of leaves in the low 24.
+fn children_hit(
+    node: u32,
+    origin: vec3<f32>,
+    inverse: vec3<f32>,
+    negative: vec3<bool>,
+    octant: u32,
+    t_max: f32,
+) -> u32 {
+    let head = nodes[node];
+    let exponents = vec3(head.w, head.w >> 8u, head.w >> 16u) & vec3(255u);
+    let scale = bitcast<vec3<f32>>(exponents << vec3(23u)) * inverse;
+    let start = (bitcast<vec3<f32>>(head.xyz) - origin) * inverse;
+    let links = nodes[node + 1u];
+    let x = nodes[node + 2u];
+    let y = nodes[node + 3u];
+    let z = nodes[node + 4u];
+    var hits = 0u;
+    for (var half = 0u; half < 2u; half++) {
+        let kinds = links[2u + half];
+        let is_inner = (kinds & (kinds << 1u)) & 0x10101010u;
+        let slots = (kinds ^ (octant & ((is_inner >> 4u) * 255u))) & 0x1f1f1f1fu;
+        let bits = (kinds >> 5u) & 0x07070707u;
+        let low_x = select(x[half], x[2u + half], negative.x);
+        let high_x = select(x[2u + half], x[half], negative.x);
+        let low_y = select(y[half], y[2u + half], negative.y);
+        let high_y = select(y[2u + half], y[half], negative.y);
+        let low_z = select(z[half], z[2u + half], negative.z);
+        let high_z = select(z[2u + half], z[half], negative.z);
+        for (var shift = 0u; shift < 32u; shift += 8u) {
+            let low = vec3<f32>(vec3(low_x >> shift, low_y >> shift, low_z >> shift) & vec3(255u));
+            let high =
+                vec3<f32>(vec3(high_x >> shift, high_y >> shift, high_z >> shift) & vec3(255u));
+            let enter = low * scale + start;
+            let leave = high * scale + start;
+            let near = max(max(enter.x, enter.y), max(enter.z, 0.0));
+            let far = min(min(leave.x, leave.y), min(leave.z, t_max));
+            if near <= far {
+                hits |= ((bits >> shift) & 255u) << ((slots >> shift) & 31u);
+            }
+        }
+    }
+    return hits;
+}
+
+// Whether anything in a tree is in the way of a ray, nearer than `t_max`.
+fn tree_occludes(
+    first_node: u32,
+    first_triangle: u32,
+    origin: vec3<f32>,
+    direction: vec3<f32>,
+    t_max: f32,
+) -> bool {
+    let negative = direction < vec3(0.0);
+    // Not infinite, which times zero would be NaN.
+    let steep = 1e27;
+    let flat = abs(direction) < vec3(1.0 / steep);
+    let inverse = select(1.0 / direction, select(vec3(steep), vec3(-steep), negative), flat);
+    let octant = select(4u, 0u, negative.x) + select(2u, 0u, negative.y)
+        + select(1u, 0u, negative.z);
+    var stack: array<vec2<u32>, STACK>;
+    var height = 0u;
+    // First child, and bits of those to walk.
+    var group = vec2(0u, 0x80000000u);
+    loop {
+        if (group.y & 0xff000000u) == 0u {
+            if height == 0u {
+                return false;
+            }
+            height -= 1u;
+            group = stack[height];
+        }
+        let bit = firstLeadingBit(group.y);
+        let inner = group.y & 255u;
+        let first = group.x;
+        group.y &= ~(1u << bit);
+        if (group.y & 0xff000000u) != 0u {
+            stack[height] = group;
+            height += 1u;
+        }
+        let slot = (bit - 24u) ^ octant;
+        let node = (first_node + first + countOneBits(inner & ~(0xffffffffu << slot))) * 5u;
+        let links = nodes[node + 1u];
+        let hits =
+            children_hit(node, origin, inverse, negative, octant * 0x01010101u, t_max);
+        var leaves = hits & 0x00ffffffu;
+        while leaves != 0u {
+            let leaf = firstTrailingBit(leaves);
+            leaves &= leaves - 1u;
+            if is_hit(first_triangle + links.y + leaf, origin, direction, t_max) {
+                return true;
+            }
+        }
+        group = vec2(links.x, (hits & 0xff000000u) | (nodes[node].w >> 24u));
+    }
+    return false;
+}
+
+fn is_occluded(origin: vec3<f32>, direction: vec3<f32>, t_max: f32) -> bool {
+    if trees.fixed_nodes > 0u && tree_occludes(0u, 0u, origin, direction, t_max) {
+        return true;
+    }
+    return trees.moving_nodes > 0u
+        && tree_occludes(trees.fixed_nodes, trees.fixed_triangles, origin, direction, t_max);
+}
+
+struct Ray {
+    origin: vec3<f32>,
+    t_max: f32,
+    direction: vec3<f32>,
+    unused: f32,
+}
+
+@group(0) @binding(6) var<storage, read> rays: array<Ray>;
+@group(0) @binding(7) var<storage, read_write> hits: array<u32>;
+
+// Rays in, hits out: a bit each.
+@compute @workgroup_size(64)
+fn occluded(@builtin(global_invocation_id) id: vec3<u32>) {
+    let first = id.x * 32u;
+    var bits = 0u;
+    for (var i = 0u; i < 32u && first + i < trees.rays; i++) {
+        let ray = rays[first + i];
+        if is_occluded(ray.origin, ray.direction, ray.t_max) {
+            bits |= 1u << i;
+        }
+    }
+    if first < trees.rays {
+        hits[id.x] = bits;
+    }
+}
+
+@group(1) @binding(0) var<uniform> eye: Eye;
+@group(1) @binding(1) var positions: texture_2d<u32>;
+@group(1) @binding(2) var worlds: texture_2d<u32>;
+@group(1) @binding(3) var depths: texture_depth_2d;
+@group(1) @binding(4) var<storage, read> placed: array<Placed>;
+@group(1) @binding(5) var<storage, read> directions: array<vec4<f32>>;
+@group(1) @binding(6) var openness: texture_storage_2d<r32float, read_write>;
+
+// As in samples.rs.
+const SETS: u32 = 64u;
+
+fn scatter(n: u32) -> u32 {
+    var x = (n ^ (n >> 16u)) * 0x7feb352du;
+    x = (x ^ (x >> 15u)) * 0x846ca68bu;
+    return x ^ (x >> 16u);
+}
+
+// Rays a pixel, each pixel its own turn of one of the sets of directions: what the earlier calls
+// found goes in with its share.
+@compute @workgroup_size(8, 8)
+fn pixels(@builtin(global_invocation_id) id: vec3<u32>) {
+    let size = textureDimensions(positions);
+    if any(id.xy >= size) {
+        return;
+    }
+    let instance = textureLoad(positions, id.xy, 0).w;
+    if instance == 0xffffffffu {
+        textureStore(openness, id.xy, vec4(1.0));
+        return;
+    }
+    let world = textureLoad(worlds, id.xy, 0).xy;
+    let normal = from_octahedral(world.x);
+    let outward = from_octahedral(world.y);
+    let depth = textureLoad(depths, id.xy, 0);
+    let place = eye.position + way_to(eye, id.xy, size) * (eye.near / depth);
+    let origin = place + outward * (placed[instance].reach / 262144.0);
+
+    let bits = scatter(id.y * size.x + id.x);
+    let turn = f32(bits >> 8u) / 16777216.0 * 6.2831853;
+    // Duff et al. 2017.
+    let side = select(-1.0, 1.0, normal.z >= 0.0);
+    let a = -1.0 / (side + normal.z);
+    let b = normal.x * normal.y * a;
+    let across = vec3(1.0 + side * normal.x * normal.x * a, side * b, -side * normal.x);
+    let upward = vec3(b, side + normal.y * normal.y * a, -normal.y);
+    let x = across * cos(turn) + upward * sin(turn);
+    let y = upward * cos(turn) - across * sin(turn);
+    let own = (bits % SETS) * (arrayLength(&directions) / SETS);
+    var open = 0u;
+    for (var i = trees.first; i < trees.first + trees.rays; i++) {
+        let d = directions[own + i].xyz;
+        let direction = x * d.x + y * d.y + normal * d.z;
+        if !is_occluded(origin, direction, trees.t_max) {
+            open++;
+        }
+    }
+    var before = 0.0;
+    if trees.first > 0u {
+        before = textureLoad(openness, id.xy).x * f32(trees.first);
+    }
+    let all = f32(trees.first + trees.rays);
+    textureStore(openness, id.xy, vec4((before + f32(open)) / all));
+}
