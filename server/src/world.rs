@@ -51,7 +51,7 @@ pub struct Options {
     pub radius_over_rm: f32,
     /// Cell size c over r.
     pub cell_over_radius: f32,
-    /// Points lie denser where occlusion changes fast, and as many fewer elsewhere.
+    /// Points lie denser where occlusion changes fast, and less dense elsewhere: as many in all.
     pub adaptive: bool,
     /// Seed of the point placement.
     pub seed: u64,
@@ -78,7 +78,7 @@ impl Options {
             kernel,
             radius_over_rm,
             cell_over_radius,
-            adaptive: true,
+            adaptive: kernel == Kernel::Planar,
             seed: 1,
             rest_space: false,
         }

@@ -21,7 +21,7 @@ const PLACES_PER_POINT: f64 = 1.0;
 pub(super) const MOST: f32 = 3.0;
 
 /// The least dense.
-const LEAST: f32 = 0.4;
+const LEAST: f32 = 0.5;
 
 /// Fits reach this many spacings of the places: some fifteen of them on a plane.
 const REACH: f32 = 2.25;
@@ -50,11 +50,7 @@ impl Pilot {
     pub fn new(mesh: &Mesh, metric: Vec3, density: f64, seed: u64) -> Pilot {
         let areas = Areas::of(mesh, metric);
         let sides = if mesh.double_sided { 2 } else { 1 };
-        let density = density
-            * std::env::var("P_PLACES")
-                .ok()
-                .and_then(|v| v.parse().ok())
-                .unwrap_or(PLACES_PER_POINT);
+        let density = density * PLACES_PER_POINT;
         let per_side = areas.total() * density;
         if !(per_side >= 1.0 && per_side * f64::from(sides) < super::MAX_POINTS as f64) {
             return Pilot::default();
@@ -203,14 +199,8 @@ pub fn densities(pilots: &[(Pilot, &Mesh, usize)]) -> Vec<Density> {
     let total: f64 = all().map(|(_, users)| users).sum();
     let mean = all().map(|(change, users)| change * users).sum::<f64>() / total.max(1.0);
     let factor = |change: f32, scale: f64| {
-        let e = |n: &str, d: f64| {
-            std::env::var(n)
-                .ok()
-                .and_then(|v| v.parse().ok())
-                .unwrap_or(d)
-        };
-        let raw = scale * (f64::from(change) / mean).powf(e("P_POW", 0.5));
-        raw.clamp(e("P_LEAST", f64::from(LEAST)), e("P_MOST", 2.0)) as f32
+        let raw = scale * (f64::from(change) / mean).sqrt();
+        raw.clamp(f64::from(LEAST), f64::from(MOST)) as f32
     };
     // The scale at which factors are 1 on average.
     let (mut low, mut high) = (0.0, 1e6);
