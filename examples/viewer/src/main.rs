@@ -18,6 +18,7 @@ use psao_server::demo::parse_size;
 use psao_server::gpu::Gpu;
 use psao_server::picture::Picture;
 use psao_server::rays::{CpuTracer, Deformed};
+use psao_server::render::REFERENCE_RAYS;
 use psao_server::scene::{Pose, Scene};
 use psao_server::server::uplink_camera;
 use std::path::PathBuf;
@@ -146,8 +147,8 @@ fn text(feed: &Feed, pictures: &Pictures, mode: Mode, overlay: Overlay, mbit: f6
     ]
 }
 
-/// Pictures that the reference needs for all its rays, and one that says so.
-const REFERENCE_PICTURES: u32 = 129;
+/// Rays that each picture of the reference adds, where nobody waits for it.
+const RAYS: u32 = 32;
 
 fn headless(
     args: &Args,
@@ -181,7 +182,8 @@ fn headless(
     let mbit = feed.client.stats().bytes as f64 * 8e-6 / seconds.max(1.0);
     let camera = path.at(seconds);
     let count = if args.mode == Mode::Reference {
-        REFERENCE_PICTURES
+        // The last says that it has them all.
+        REFERENCE_RAYS as u32 / RAYS + 1
     } else {
         2
     };
@@ -191,6 +193,7 @@ fn headless(
         let shown = Shown {
             camera: &camera,
             mode: args.mode,
+            rays: RAYS,
             overlay: args.overlay,
             text: &text,
         };

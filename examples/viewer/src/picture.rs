@@ -56,15 +56,14 @@ struct Look {
 /// Letters across and lines of the text.
 pub const TEXT: [usize; 2] = [34, 9];
 
-/// Rays a pixel of the reference in one picture.
-const RAYS: u32 = 4;
-
 /// What is shown.
 pub struct Shown<'a> {
     /// Where from.
     pub camera: &'a Camera,
     /// Where occlusion comes from.
     pub mode: Mode,
+    /// Rays a pixel that the reference gains with the picture; a divisor of 512.
+    pub rays: u32,
     /// What is drawn over it.
     pub overlay: Overlay,
     /// Lines of text in the corner.
@@ -240,14 +239,14 @@ impl Pictures {
                     self.rays = 0;
                 }
                 if self.rays < REFERENCE_RAYS as u32 {
-                    let rays = [self.rays, RAYS];
+                    let rays = [self.rays, shown.rays];
                     let (renderer, reach) = (&self.renderer, self.radius_m);
                     let buffer = &self.targets.buffer;
                     let openness = &self.targets.openness;
                     self.tracer
                         .pixels(gpu, buffer, renderer, openness, reach, rays)
                         .record(&mut encoder);
-                    self.rays += RAYS;
+                    self.rays += shown.rays;
                 }
             }
             Mode::Off => clear(&mut encoder, &open),

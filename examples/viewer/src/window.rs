@@ -33,6 +33,8 @@ enum Moves {
 const RATE_S: f64 = 1.0;
 /// Seconds of one turn around what is in the middle.
 const TURN_S: f32 = 20.0;
+/// Rays that each picture of the reference adds: few, so that the window answers.
+const RAYS: u32 = 4;
 /// Radians a pixel of the mouse.
 const LOOK: f32 = 0.004;
 
@@ -326,6 +328,7 @@ impl App<'_> {
         let what = Shown {
             camera: &self.camera,
             mode: self.mode,
+            rays: RAYS,
             overlay: self.overlay,
             text: &lines,
         };
