@@ -44,6 +44,9 @@ pub struct SceneArgs {
     /// How a fragment blends the points around it; decides radius and cell size
     #[arg(long, value_enum, default_value_t = KernelArg::Planar)]
     pub kernel: KernelArg,
+    /// How points are spread over surfaces
+    #[arg(long, value_enum, default_value_t = PlacementArg::Uniform)]
+    pub placement: PlacementArg,
     /// Seed of the point placement and of the boulders
     #[arg(long, value_name = "N", default_value_t = 1)]
     pub seed: u64,
@@ -178,6 +181,7 @@ impl SceneArgs {
             rays: self.rays,
             refresh_steps: self.refresh_steps.unwrap_or(1),
             ao_distance_m: self.ao_distance,
+            adaptive: self.placement == PlacementArg::Adaptive,
             seed: self.seed,
             ..Options::of(kernel)
         })

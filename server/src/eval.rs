@@ -85,8 +85,9 @@ pub struct EvalArgs {
     #[arg(long, value_name = "N", default_value_t = 60,
           value_parser = clap::value_parser!(u32).range(2..=100_000))]
     pub frames: u32,
-    /// Kernels to compare instead of profiles: paper, paper-nearest, planar, ..., each with its
-    /// radius over rm and cell size over the radius if they are not the usual ones
+    /// Kernels to compare instead of profiles: paper, paper-nearest, band, planar, planar-unfaded,
+    /// planar-dark, least-squares, each with its radius over rm and cell size over the radius if
+    /// they are not the usual ones
     #[arg(long, value_name = "NAME[@R[/C]],...", value_delimiter = ',')]
     pub kernels: Vec<kernels::Variant>,
     /// Points that a cell holds (with --kernels)
@@ -94,7 +95,12 @@ pub struct EvalArgs {
           value_parser = clap::value_parser!(u8).range(1..=15))]
     pub capacities: Vec<u8>,
     /// How points are spread (with --kernels)
-    #[arg(long, value_enum, value_delimiter = ',', default_value = "adaptive")]
+    #[arg(
+        long,
+        value_enum,
+        value_delimiter = ',',
+        default_value = "uniform,adaptive"
+    )]
     pub placements: Vec<PlacementArg>,
     /// Which of the two camera paths to walk: tune (or 0) and check (or 1)
     #[arg(long, value_name = "PATH", default_value = "check", value_parser = parse_path)]

@@ -63,12 +63,12 @@ pub struct Options {
 
 impl Options {
     /// The defaults of a kernel. `Paper`: r is the spacing that elimination reaches, 1.41 rm, and
-    /// 2×2×2 cells cover the whole radius (c = 2r). `Planar`: r = 2 rm and c = 1.1 r, where
-    /// 2×2×2 cells hold everything nearer than 0.55 r, and fewer points are read.
+    /// 2×2×2 cells cover the whole radius (c = 2r). `Planar`: r = 2 rm and c = 1.25 r, where
+    /// 2×2×2 cells hold everything nearer than 0.625 r, and fewer points are read.
     pub fn of(kernel: Kernel) -> Options {
         let (radius_over_rm, cell_over_radius) = match kernel {
             Kernel::Paper => (1.41, 2.0),
-            Kernel::Planar => (2.0, 1.1),
+            Kernel::Planar => (2.0, 1.25),
         };
         Options {
             density: 512.0,
@@ -78,7 +78,7 @@ impl Options {
             kernel,
             radius_over_rm,
             cell_over_radius,
-            adaptive: kernel == Kernel::Planar,
+            adaptive: false,
             seed: 1,
             rest_space: false,
         }

@@ -20,8 +20,8 @@ const PLACES_PER_POINT: f64 = 1.0;
 /// The densest that points may lie, over the mean.
 pub(super) const MOST: f32 = 3.0;
 
-/// The least dense.
-const LEAST: f32 = 0.5;
+/// The least dense: any less, and blocks of cells without a point are common.
+const LEAST: f32 = 0.7;
 
 /// Fits reach this many spacings of the places: some fifteen of them on a plane.
 const REACH: f32 = 2.25;
