@@ -317,15 +317,14 @@ impl Gpu {
 /// difference.
 fn compare(shot: &Shot, got: &[f32], expected: &[f32]) -> [f32; 3] {
     assert_eq!(got.len(), expected.len());
-    let off: Vec<f32> = got
-        .iter()
-        .zip(expected)
-        .map(|(a, b)| (a - b).abs())
-        .collect();
     // A NaN is as far off as can be.
-    let largest = off.iter().fold(0.0, |m, &v| if v <= m { m } else { v });
+    let off = got.iter().zip(expected).map(|(a, b)| (a - b).abs());
+    let off: Vec<f32> = off
+        .map(|v| if v.is_nan() { f32::INFINITY } else { v })
+        .collect();
+    let largest = off.iter().copied().fold(0.0, f32::max);
     let seen = shot.view.valid().iter().filter(|valid| **valid).count() as f32;
-    let beyond = |steps: f32| off.iter().filter(|v| !(**v <= steps * STEP)).count() as f32 / seen;
+    let beyond = |steps: f32| off.iter().filter(|v| **v > steps * STEP).count() as f32 / seen;
     [beyond(1.0), beyond(4.0), largest]
 }
 
