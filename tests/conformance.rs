@@ -68,7 +68,7 @@ fn the_streams_are_what_their_recordings_give_and_no_file_lacks() {
 }
 
 /// Clauses of these sections of which a stream alone can show nothing: definitions, advice, what
-/// writers do, and (4.3, 4.5) what follows from a reader's own room; `tests/stream.rs` and
+/// writers do, and (4.3, 4.5) what follows from a reader's own room; `tests/stream` and
 /// `tests/c/abi.c` check that.
 const WITHOUT_STREAMS: &[&str] = &["2.1", "4.3", "4.4", "4.5", "4.6", "6.5", "8.4", "15.15"];
 
