@@ -210,6 +210,8 @@ fn the_other_side_of_cloth_and_of_foliage_does_not_show() {
             let up = Vec3::Y * (d - b).y;
             spread(a, b - a, up).into_iter().step_by(17)
         })
+        // At its very edge a block may hold no point of the near side.
+        .filter(|[p, _]| (0.06..0.94).contains(&p.x) && (0.06..0.94).contains(&p.y))
         .collect();
     place(&mut scene, cloth);
     scene.set_origin();
