@@ -210,6 +210,8 @@ fn the_other_side_of_cloth_and_of_foliage_does_not_show() {
             let up = Vec3::Y * (d - b).y;
             spread(a, b - a, up).into_iter().step_by(17)
         })
+        // At its very edge a block may hold no point of the near side.
+        .filter(|[p, _]| (0.06..0.94).contains(&p.x) && (0.06..0.94).contains(&p.y))
         .collect();
     place(&mut scene, cloth);
     scene.set_origin();
@@ -288,14 +290,23 @@ fn still_pixels_do_not_shimmer_and_moving_ones_lag_little() {
                 }
             }
             // Still: always the same place, with nothing in reach of it that moves.
-            let near = |p: Vec3| {
-                (0..truth.scene.instances.len()).any(|i| {
-                    let instance = &truth.scene.instances[i];
-                    (instance.moves || instance.deforms) && {
-                        let at = truth.pose.instances[i].world_from_local.translation;
-                        Vec3::from(at).distance(p) < 2.5
-                    }
+            let movers = (0..truth.scene.instances.len() as u32).filter(|&i| {
+                let instance = &truth.scene.instances[i as usize];
+                instance.moves || instance.deforms
+            });
+            let bounds = movers.map(|i| {
+                let placed = truth.pose.instances[i as usize].world_from_local;
+                let vertices = truth.vertices(i).0.iter();
+                let vertices = vertices.map(|p| placed.transform_point3(*p));
+                vertices.fold([Vec3::INFINITY, Vec3::NEG_INFINITY], |[min, max], p| {
+                    [min.min(p), max.max(p)]
                 })
+            });
+            let bounds: Vec<[Vec3; 2]> = bounds.collect();
+            // Rays reach 0.6 m, and blocks two cells of 0.17 m further.
+            let near = |p: Vec3| {
+                let far = |[min, max]: &[Vec3; 2]| p.clamp(*min, *max).distance(p) > 1.0;
+                !bounds.iter().all(far)
             };
             let same = first.get_or_insert_with(|| view.clone());
             still.resize(view.fragments.len(), true);

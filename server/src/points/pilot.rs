@@ -215,7 +215,7 @@ pub fn densities(pilots: &[(Pilot, &Mesh, usize)]) -> Vec<Density> {
             high = scale;
         }
     }
-    let even = mean.is_nan() || mean <= 0.0;
+    let even = mean <= 0.0;
     let density = |(pilot, mesh, _): &(Pilot, &Mesh, usize)| {
         let box_m = pilot.reach * 0.75;
         let mut sums: HashMap<(IVec3, u8), [f32; 2]> = HashMap::new();
