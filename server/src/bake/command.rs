@@ -69,7 +69,7 @@ pub struct BakeArgs {
     #[arg(long, value_name = "TEXELS", default_value_t = 1024)]
     pub resolution: u32,
     /// Texels of a depth map that elements are lifted off their surface
-    #[arg(long, value_name = "TEXELS", default_value_t = 1.0)]
+    #[arg(long, value_name = "TEXELS", default_value_t = 0.75)]
     pub bias: f32,
     /// Directions between two read-backs from the GPU; 0 for one read-back at the end
     #[arg(long, value_name = "N", default_value_t = 0)]
