@@ -42,22 +42,17 @@ impl Shot {
     }
 
     fn cpu(&self, kernel: Kernel) -> Vec<f32> {
-        self.view
-            .blend(self.client.mirror().lookup(), kernel)
-            .openness
+        self.view.blend(self.client.mirror().lookup(), kernel).openness
     }
 
     /// The G-buffer's two textures: positions and instances, normals.
     fn g_buffer(&self) -> [Vec<u8>; 2] {
         let (mut positions, mut normals) = (Vec::new(), Vec::new());
         for fragment in &self.view.fragments {
-            let (position, normal) =
-                fragment
-                    .as_ref()
-                    .map_or(([0, 0, 0, u32::MAX], [0.0; 4]), |f| {
-                        let [x, y, z] = f.position.to_array().map(f32::to_bits);
-                        ([x, y, z, f.instance], f.normal.extend(0.0).to_array())
-                    });
+            let (position, normal) = fragment.as_ref().map_or(([0, 0, 0, u32::MAX], [0.0; 4]), |f| {
+                let [x, y, z] = f.position.to_array().map(f32::to_bits);
+                ([x, y, z, f.instance], f.normal.extend(0.0).to_array())
+            });
             positions.extend_from_slice(bytemuck::bytes_of(&position));
             normals.extend_from_slice(bytemuck::bytes_of(&normal));
         }
@@ -143,8 +138,7 @@ impl Stream {
             eye: None,
         };
         let now_ns = (time_s * 1e9) as u64;
-        self.encoder
-            .frame(&self.world, now_ns, &view, true, &mut bytes);
+        self.encoder.frame(&self.world, now_ns, &view, true, &mut bytes);
         let mut rest = &bytes[..];
         while !rest.is_empty() {
             let pushed = client.push(rest).unwrap();
@@ -228,8 +222,7 @@ impl Gpu {
         let mut encoder = self.encoder();
         encoder.copy_buffer_to_buffer(buffer, 0, &copy, 0, buffer.size());
         self.submit(encoder);
-        copy.slice(..)
-            .map_async(wgpu::MapMode::Read, |done| done.unwrap());
+        copy.slice(..).map_async(wgpu::MapMode::Read, |done| done.unwrap());
         self.device.poll(PollType::wait_indefinitely()).unwrap();
         copy.slice(..).get_mapped_range().unwrap().to_vec()
     }
@@ -290,8 +283,7 @@ impl Gpu {
         self.submit(encoder);
         let bytes = self.read(&copy);
         let rows = bytes.chunks(row_bytes).map(|row| &row[..WIDTH * 4]);
-        rows.flat_map(bytemuck::pod_collect_to_vec::<u8, f32>)
-            .collect()
+        rows.flat_map(bytemuck::pod_collect_to_vec::<u8, f32>).collect()
     }
 }
 
@@ -301,11 +293,7 @@ impl Gpu {
 /// difference.
 fn compare(shot: &Shot, got: &[f32], expected: &[f32]) -> [f32; 3] {
     assert_eq!(got.len(), expected.len());
-    let off: Vec<f32> = got
-        .iter()
-        .zip(expected)
-        .map(|(a, b)| (a - b).abs())
-        .collect();
+    let off: Vec<f32> = got.iter().zip(expected).map(|(a, b)| (a - b).abs()).collect();
     // A NaN is as far off as can be.
     let largest = off.iter().fold(0.0, |m, &v| if v <= m { m } else { v });
     let seen = shot.view.valid().iter().filter(|valid| **valid).count() as f32;
@@ -316,11 +304,7 @@ fn compare(shot: &Shot, got: &[f32], expected: &[f32]) -> [f32; 3] {
 fn assert_exact(shot: &Shot, what: &str, got: &[f32], kernel: Kernel) {
     let expected = shot.cpu(kernel);
     let varied = expected.iter().filter(|v| **v > 0.1 && **v < 0.9).count();
-    assert!(
-        varied > WIDTH * HEIGHT / 50,
-        "{}: a dull picture",
-        shot.name
-    );
+    assert!(varied > WIDTH * HEIGHT / 50, "{}: a dull picture", shot.name);
     let [one, _, largest] = compare(shot, got, &expected);
     assert!(
         one == 0.0,
@@ -372,12 +356,10 @@ fn the_text_for_fragment_shaders_gives_the_same_picture() {
     }
     return vec4<f32>(psao_planar_fast(position.w, bitcast<vec3<f32>>(position.xyz), normal));
 }";
-    let module = gpu
-        .device
-        .create_shader_module(wgpu::ShaderModuleDescriptor {
-            label: None,
-            source: wgpu::ShaderSource::Wgsl(text.into()),
-        });
+    let module = gpu.device.create_shader_module(wgpu::ShaderModuleDescriptor {
+        label: None,
+        source: wgpu::ShaderSource::Wgsl(text.into()),
+    });
     let buffers = gpu.buffers(&shot.client);
     let texture = |binding, sample_type| wgpu::BindGroupLayoutEntry {
         binding,
@@ -393,42 +375,36 @@ fn the_text_for_fragment_shaders_gives_the_same_picture() {
         texture(0, wgpu::TextureSampleType::Uint),
         texture(1, wgpu::TextureSampleType::Float { filterable: false }),
     ];
-    let layout = gpu
-        .device
-        .create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor {
-            label: None,
-            entries: &entries,
-        });
-    let pipeline_layout = gpu
-        .device
-        .create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
-            label: None,
-            bind_group_layouts: &[Some(&layout), Some(buffers.bind_group_layout())],
-            immediate_size: 0,
-        });
-    let pipeline = gpu
-        .device
-        .create_render_pipeline(&wgpu::RenderPipelineDescriptor {
-            label: None,
-            layout: Some(&pipeline_layout),
-            vertex: wgpu::VertexState {
-                module: &module,
-                entry_point: Some("corner"),
-                compilation_options: wgpu::PipelineCompilationOptions::default(),
-                buffers: &[],
-            },
-            primitive: wgpu::PrimitiveState::default(),
-            depth_stencil: None,
-            multisample: wgpu::MultisampleState::default(),
-            fragment: Some(wgpu::FragmentState {
-                module: &module,
-                entry_point: Some("shade"),
-                compilation_options: wgpu::PipelineCompilationOptions::default(),
-                targets: &[Some(TextureFormat::R32Float.into())],
-            }),
-            multiview_mask: None,
-            cache: None,
-        });
+    let layout = gpu.device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor {
+        label: None,
+        entries: &entries,
+    });
+    let pipeline_layout = gpu.device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
+        label: None,
+        bind_group_layouts: &[Some(&layout), Some(buffers.bind_group_layout())],
+        immediate_size: 0,
+    });
+    let pipeline = gpu.device.create_render_pipeline(&wgpu::RenderPipelineDescriptor {
+        label: None,
+        layout: Some(&pipeline_layout),
+        vertex: wgpu::VertexState {
+            module: &module,
+            entry_point: Some("corner"),
+            compilation_options: wgpu::PipelineCompilationOptions::default(),
+            buffers: &[],
+        },
+        primitive: wgpu::PrimitiveState::default(),
+        depth_stencil: None,
+        multisample: wgpu::MultisampleState::default(),
+        fragment: Some(wgpu::FragmentState {
+            module: &module,
+            entry_point: Some("shade"),
+            compilation_options: wgpu::PipelineCompilationOptions::default(),
+            targets: &[Some(TextureFormat::R32Float.into())],
+        }),
+        multiview_mask: None,
+        cache: None,
+    });
     let [positions, normals] = shot.g_buffer();
     let views = [
         gpu.filled(TextureFormat::Rgba32Uint, &positions),
@@ -472,14 +448,7 @@ fn the_glsl_snippets_give_the_same_picture_in_an_es_3_1_context() {
     std::fs::create_dir_all(&folder).unwrap();
     let program = folder.join("gles");
     run(Command::new("cc")
-        .args([
-            "-std=c99",
-            "-Wall",
-            "-Wextra",
-            "-Werror",
-            "-pedantic",
-            "-O1",
-        ])
+        .args(["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O1"])
         .arg(root().join("tests/c/gles.c"))
         .args(["-lEGL", "-lGLESv2", "-o"])
         .arg(&program));
@@ -548,11 +517,7 @@ fn only_what_changed_is_uploaded_and_then_the_gpu_has_the_mirror() {
             later += done.bytes;
         }
         let again = buffers.upload(&mut gpu.encoder(), client.mirror());
-        assert_eq!(
-            again,
-            psao_gpu::Uploaded::default(),
-            "nothing is left to upload"
-        );
+        assert_eq!(again, psao_gpu::Uploaded::default(), "nothing is left to upload");
         let mirror = client.mirror();
         let parts: [(Buffer, &[u8]); 3] = [
             (Buffer::Instances, bytemuck::cast_slice(mirror.instances())),
@@ -565,10 +530,7 @@ fn only_what_changed_is_uploaded_and_then_the_gpu_has_the_mirror() {
         }
     }
     let all = mirror_bytes(client.mirror());
-    assert!(
-        later < 23 * all / 4,
-        "{later} bytes in 23 frames, of {all} a whole upload"
-    );
+    assert!(later < 23 * all / 4, "{later} bytes in 23 frames, of {all} a whole upload");
 }
 
 fn mirror_bytes<M: psao_core::mirror::Memory>(mirror: &Mirror<M>) -> u64 {
@@ -584,11 +546,6 @@ fn buffers_larger_than_the_device_allows_are_refused_with_the_limit() {
         ..Capacity::default()
     };
     let error = Buffers::new(&GPU.device, capacity).unwrap_err();
-    assert!(
-        error
-            .to_string()
-            .contains("max_storage_buffer_binding_size"),
-        "{error}"
-    );
+    assert!(error.to_string().contains("max_storage_buffer_binding_size"), "{error}");
     assert_eq!((error.buffer, error.limit_bytes), ("psao cells", 128 << 20));
 }

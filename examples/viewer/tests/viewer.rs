@@ -131,28 +131,13 @@ fn a_live_server_is_followed() {
     }
     let word = |name: &str| {
         let mut words = text.split_whitespace().skip_while(|word| *word != name);
-        words
-            .nth(1)
-            .unwrap_or_else(|| panic!("no {name} in {text}"))
-            .to_string()
+        words.nth(1).unwrap_or_else(|| panic!("no {name} in {text}")).to_string()
     };
     let picture = |mode: &str| {
         let file = folder.path().join(format!("{mode}.png"));
         let out = viewer()
-            .args([
-                word("listening"),
-                "--fingerprint".into(),
-                word("fingerprint"),
-            ])
-            .args([
-                "--token",
-                "T",
-                "--headless",
-                "--frames",
-                "8",
-                "--size",
-                "192x108",
-            ])
+            .args([word("listening"), "--fingerprint".into(), word("fingerprint")])
+            .args(["--token", "T", "--headless", "--frames", "8", "--size", "192x108"])
             .args(["--mode", mode, "--out"])
             .arg(&file)
             .output()

@@ -53,7 +53,10 @@ fn generated(root: &Path) -> Result<Vec<(&'static str, String)>, String> {
         .iter()
         .map(|name| format!("{name}\n"))
         .collect();
-    let mut files = vec![("include/psao.h", header), ("sdk/ffi/exports.txt", exports)];
+    let mut files = vec![
+        ("include/psao.h", header),
+        ("sdk/ffi/exports.txt", exports),
+    ];
     files.extend(shaders::generate(root)?);
     Ok(files)
 }

@@ -119,7 +119,9 @@ impl Source {
         let options = glsl::Options {
             version: glsl::Version::new_gles(version),
             writer_flags: glsl::WriterFlags::empty(),
-            binding_map: (0..3).map(|slot| (resource(slot), slot as u8)).collect(),
+            binding_map: (0..3)
+                .map(|slot| (resource(slot), slot as u8))
+                .collect(),
             zero_initialize_workgroup_memory: false,
         };
         let pipeline = glsl::PipelineOptions {
@@ -228,9 +230,7 @@ fn without_struct(text: &str, head: &str) -> String {
     let Some(start) = text.find(head) else {
         return text.into();
     };
-    let end = text[start..]
-        .find("};\n")
-        .map_or(text.len(), |at| start + at + 3);
+    let end = text[start..].find("};\n").map_or(text.len(), |at| start + at + 3);
     format!("{}{}", &text[..start], &text[end..])
 }
 
@@ -274,10 +274,7 @@ mod tests {
             .unwrap_or_else(|error| panic!("{program}: {error}: tests/run installs it"));
         let said = String::from_utf8_lossy(&output.stdout).into_owned();
         let error = String::from_utf8_lossy(&output.stderr).into_owned();
-        assert!(
-            output.status.success(),
-            "{program} {words:?}: {said}{error}"
-        );
+        assert!(output.status.success(), "{program} {words:?}: {said}{error}");
     }
 
     const GLSL_MAIN: &str = "
@@ -340,29 +337,16 @@ float4 main(float3 position : P, float3 normal : N, nointerpolation uint instanc
             };
             let words = spv::write_vec(&source.module, &source.info, &options, None).unwrap();
             let bytes: Vec<u8> = words.iter().flat_map(|word| word.to_le_bytes()).collect();
-            valid(
-                "spirv-val",
-                &["--target-env", "vulkan1.1"],
-                "shader.spv",
-                &bytes,
-            );
+            valid("spirv-val", &["--target-env", "vulkan1.1"], "shader.spv", &bytes);
         }
     }
 
     #[test]
     fn names_of_snippets_do_not_meet_those_of_an_engine() {
-        for name in [
-            "psao_es310.glsl",
-            "psao_es300.glsl",
-            "psao.hlsl",
-            "psao.metal",
-        ] {
+        for name in ["psao_es310.glsl", "psao_es300.glsl", "psao.hlsl", "psao.metal"] {
             let text = snippet(name);
             assert!(!text.contains("psao_probe"), "{name} has the probe in it");
-            assert!(
-                !text.contains("type_"),
-                "{name} has a name of a type's number"
-            );
+            assert!(!text.contains("type_"), "{name} has a name of a type's number");
             for function in ["psao_planar_fast(", "psao_planar(", "psao_paper("] {
                 assert!(text.contains(function), "{name} lacks {function}");
             }
@@ -371,9 +355,7 @@ float4 main(float3 position : P, float3 normal : N, nointerpolation uint instanc
 
     #[test]
     fn wrong_source_is_refused_with_its_place() {
-        let error = Source::parse("storage.wgsl", "fn psao_x( {", "")
-            .err()
-            .unwrap();
+        let error = Source::parse("storage.wgsl", "fn psao_x( {", "").err().unwrap();
         assert!(error.contains("psao.wgsl with storage.wgsl") && error.contains("wgsl:1"));
     }
 }

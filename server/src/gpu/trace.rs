@@ -218,7 +218,7 @@ impl GpuTracer {
         let textures = [&buffer.position, &buffer.world, &buffer.depth, openness].map(view);
         let [position, world, depth, openness] = textures
             .each_ref()
-            .map(wgpu::BindingResource::TextureView);
+            .map(|view| wgpu::BindingResource::TextureView(view));
         let pixels = [
             (0, buffer.eye.as_entire_binding()),
             (1, position),
