@@ -1,6 +1,7 @@
 //! The PSAO reference server: `scene ─► points ─► occlusion ─► select ─► encode ─► transport`.
 
 pub mod args;
+pub mod bake;
 #[cfg(feature = "gpu")]
 pub mod bench_gpu;
 pub mod camera;

@@ -2,6 +2,7 @@
 
 use clap::{Parser, Subcommand};
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
+use psao_server::bake::command::{self as bake, BakeArgs};
 #[cfg(feature = "gpu")]
 use psao_server::bench_gpu::{self, BenchGpuArgs};
 use psao_server::commands::{self, InspectArgs, PlayArgs, RecordArgs, ServeArgs};
@@ -34,6 +35,8 @@ enum Command {
     Inspect(InspectArgs),
     /// Measures bits, error and time of the profiles on the same frames
     Eval(Box<EvalArgs>),
+    /// Bakes occlusion into a scene's vertices or a texture, as points or as spherical harmonics
+    Bake(Box<BakeArgs>),
     /// Races the lookup on the GPU against screen-space and ray-traced occlusion
     #[cfg(feature = "gpu")]
     BenchGpu(Box<BenchGpuArgs>),
@@ -74,6 +77,10 @@ fn main() -> ExitCode {
         Command::Eval(args) => eval::run(args, &progress).map(|found| {
             bars.finish();
             found.table()
+        }),
+        Command::Bake(args) => bake::run(args, &progress).map(|report| {
+            bars.finish();
+            report.table()
         }),
         #[cfg(feature = "gpu")]
         Command::BenchGpu(args) => bench_gpu::run(args, &progress).map(|race| {

@@ -3,6 +3,7 @@
 //! Nothing here is the SDK's: engines take `psao-gpu` and the shader snippets. The G-buffer is the
 //! one that they share: position and normal in an instance's local (or rest) space, and depth.
 
+pub mod depth;
 pub mod gbuffer;
 pub mod screen;
 pub mod trace;

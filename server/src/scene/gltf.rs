@@ -27,7 +27,7 @@ use super::{
 };
 
 /// Bytes of all files of a scene together.
-const MAX_FILE_BYTES: u64 = 1 << 30;
+pub(crate) const MAX_FILE_BYTES: u64 = 1 << 30;
 /// Bytes decoded from them: few bytes can name the same data many times.
 const MAX_DECODED_BYTES: u64 = 4 << 30;
 /// Texels of a mask.
@@ -60,8 +60,38 @@ impl Scene {
     /// Names the file, what in it is wrong, and what to do: missing or damaged files, geometry
     /// compression (Draco, meshopt), a broken hierarchy, sizes beyond what a scene can be.
     pub fn load(path: &Path, unit_m: f64) -> Result<Scene, SceneError> {
+        Scene::load_with_origins(path, unit_m).map(|(scene, _)| scene)
+    }
+
+    /// The same, and where in the file everything came from: for who writes to the file again.
+    ///
+    /// # Errors
+    /// As [`Scene::load`].
+    pub fn load_with_origins(path: &Path, unit_m: f64) -> Result<(Scene, Origins), SceneError> {
         load(path, unit_m).map_err(|what| SceneError(format!("{}: {what}", path.display())))
     }
+}
+
+/// Where in a glTF file a scene's parts came from.
+#[derive(Clone, Debug, Default)]
+pub struct Origins {
+    /// One a mesh of the scene.
+    pub meshes: Vec<MeshOrigin>,
+    /// The file's node of each instance of the scene.
+    pub nodes: Vec<usize>,
+}
+
+/// Where a mesh of a scene came from.
+#[derive(Clone, Debug, Default)]
+pub struct MeshOrigin {
+    /// The file's mesh.
+    pub mesh: usize,
+    /// Which of its primitives.
+    pub primitive: usize,
+    /// For each vertex of the scene's mesh, the vertex of the primitive.
+    pub vertices: Vec<u32>,
+    /// Vertices of the primitive, also those that no triangle uses.
+    pub count: usize,
 }
 
 /// Node transforms in double precision: the `gltf` crate has them in single, which is too coarse
@@ -78,7 +108,7 @@ struct PreciseNode {
     translation: Option<[f64; 3]>,
 }
 
-fn load(path: &Path, unit_m: f64) -> Result<Scene, String> {
+fn load(path: &Path, unit_m: f64) -> Result<(Scene, Origins), String> {
     if !(unit_m.is_finite() && unit_m > 0.0) {
         return Err(format!(
             "a unit of {unit_m} m: give metres per unit, above 0"
@@ -127,6 +157,7 @@ fn load(path: &Path, unit_m: f64) -> Result<Scene, String> {
         node_of: vec![None; root.nodes.len()],
         masks: BTreeMap::new(),
         scene: Scene::default(),
+        origins: Origins::default(),
     };
     loader.scene.name = path
         .file_name()
@@ -138,7 +169,7 @@ fn load(path: &Path, unit_m: f64) -> Result<Scene, String> {
     loader.instances()?;
     loader.bind_strays();
     loader.animation();
-    let mut scene = loader.scene;
+    let (mut scene, origins) = (loader.scene, loader.origins);
     if scene.instances.is_empty() {
         return Err(
             "no node of its scene places a mesh with triangles; export one that does".into(),
@@ -159,11 +190,11 @@ fn load(path: &Path, unit_m: f64) -> Result<Scene, String> {
              check its node transforms and the metres per unit ({unit_m})"
         ));
     }
-    Ok(scene)
+    Ok((scene, origins))
 }
 
 /// Reads a file, and takes its size off what may still be read.
-fn read_file(path: &Path, left: &mut u64) -> Result<Vec<u8>, String> {
+pub(crate) fn read_file(path: &Path, left: &mut u64) -> Result<Vec<u8>, String> {
     let cannot = |error: std::io::Error| {
         format!(
             "cannot read {}: {error}; put the file there, or correct the path",
@@ -188,7 +219,7 @@ fn read_file(path: &Path, left: &mut u64) -> Result<Vec<u8>, String> {
 }
 
 /// The JSON and the binary chunk of a `.glb`; of any other file, the file and nothing.
-fn split_glb(bytes: &[u8]) -> Result<(&[u8], &[u8]), String> {
+pub(crate) fn split_glb(bytes: &[u8]) -> Result<(&[u8], &[u8]), String> {
     if !bytes.starts_with(b"glTF") {
         return Ok((bytes, &[]));
     }
@@ -251,7 +282,7 @@ fn check_extensions(root: &json::Root) -> Result<(), String> {
 }
 
 /// What a URI names: `data:`, or a file relative to the scene's.
-fn read_uri(uri: &str, folder: &Path, left: &mut u64) -> Result<Vec<u8>, String> {
+pub(crate) fn read_uri(uri: &str, folder: &Path, left: &mut u64) -> Result<Vec<u8>, String> {
     if let Some(data) = uri.strip_prefix("data:") {
         let (_, text) = data
             .split_once(";base64,")
@@ -337,6 +368,7 @@ struct Loader<'a> {
     /// By material.
     masks: BTreeMap<usize, Alpha>,
     scene: Scene,
+    origins: Origins,
 }
 
 impl Loader<'_> {
@@ -663,6 +695,7 @@ impl Loader<'_> {
                     moves,
                     deforms,
                 });
+                self.origins.nodes.push(index);
             }
             meshes[mesh] = Some(primitives);
         }
@@ -681,9 +714,15 @@ impl Loader<'_> {
                 .primitive(primitive, &name)
                 .map_err(|what| format!("{name}: {what}"))?
             {
-                Some(mesh) => {
+                Some((mesh, vertices, count)) => {
                     primitives.push(self.scene.meshes.len() as u32);
                     self.scene.meshes.push(mesh);
+                    self.origins.meshes.push(MeshOrigin {
+                        mesh: index,
+                        primitive: number,
+                        vertices,
+                        count,
+                    });
                 }
                 None => self.scene.dropped.empty_primitives += 1,
             }
@@ -691,11 +730,13 @@ impl Loader<'_> {
         Ok(primitives)
     }
 
+    /// A primitive's mesh, which vertex of the primitive each of its vertices was, and how many
+    /// the primitive has. Nothing where it has no triangle.
     fn primitive(
         &mut self,
         primitive: &json::mesh::Primitive,
         name: &str,
-    ) -> Result<Option<Mesh>, String> {
+    ) -> Result<Option<(Mesh, Vec<u32>, usize)>, String> {
         let attribute = |semantic| primitive.attributes.get(&Checked::Valid(semantic));
         let attribute = |semantic| attribute(semantic).map(|accessor| accessor.value());
         let Some(positions) = attribute(Semantic::Positions) else {
@@ -820,12 +861,12 @@ impl Loader<'_> {
                 .collect(),
             _ => indices.as_chunks::<3>().0.to_vec(),
         };
-        self.repair(&mut mesh)?;
-        Ok((!mesh.triangles.is_empty()).then_some(mesh))
+        let vertices = self.repair(&mut mesh)?;
+        Ok((!mesh.triangles.is_empty()).then_some((mesh, vertices, count)))
     }
 
-    /// Makes the mesh keep what [`Mesh`] promises.
-    fn repair(&mut self, mesh: &mut Mesh) -> Result<(), String> {
+    /// Makes the mesh keep what [`Mesh`] promises; which vertex each of its vertices was before.
+    fn repair(&mut self, mesh: &mut Mesh) -> Result<Vec<u32>, String> {
         let count = mesh.positions.len();
         let dropped = &mut self.scene.dropped;
         let good = |v: Vec3| v.abs().max_element() <= MAX_COORDINATE && !v.is_nan();
@@ -887,7 +928,7 @@ impl Loader<'_> {
                 let normal = area_vector(&mesh.positions, triangle).normalize().as_vec3();
                 mesh.normals.extend([normal; 3]);
             }
-            return Ok(());
+            return Ok(corners);
         }
 
         // Vertices that no triangle uses would only widen the bounds.
@@ -908,6 +949,7 @@ impl Loader<'_> {
             for v in mesh.triangles.as_flattened_mut() {
                 *v = used[*v as usize];
             }
+            used = (0..count as u32).collect();
         }
         // Normals that are no directions are made from the triangles around them.
         let mut sums = vec![DVec3::ZERO; mesh.positions.len()];
@@ -921,7 +963,7 @@ impl Loader<'_> {
                 .unwrap_or(DVec3::Y)
                 .as_vec3();
         }
-        Ok(())
+        Ok(used)
     }
 
     /// Vertices whose joints a skin does not have follow its first joint. A mesh may be used with
@@ -1283,7 +1325,7 @@ fn label(kind: &str, index: usize, name: Option<&str>) -> String {
     )
 }
 
-fn component_bytes(component: ComponentType) -> usize {
+pub(crate) fn component_bytes(component: ComponentType) -> usize {
     match component {
         ComponentType::I8 | ComponentType::U8 => 1,
         ComponentType::I16 | ComponentType::U16 => 2,
@@ -1291,7 +1333,7 @@ fn component_bytes(component: ComponentType) -> usize {
     }
 }
 
-fn to_float(component: ComponentType, normalized: bool, bytes: &[u8]) -> Option<f32> {
+pub(crate) fn to_float(component: ComponentType, normalized: bool, bytes: &[u8]) -> Option<f32> {
     let (value, full) = match component {
         ComponentType::F32 => return Some(f32::from_le_bytes(bytes.try_into().ok()?)),
         ComponentType::I8 => (f32::from(i8::from_le_bytes(bytes.try_into().ok()?)), 127.0),

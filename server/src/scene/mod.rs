@@ -5,12 +5,13 @@
 //! origin is subtracted there.
 
 mod atrium;
-mod gltf;
+pub(crate) mod gltf;
 
 use std::fmt;
 use std::path::PathBuf;
 use std::str::FromStr;
 
+pub use self::gltf::{MeshOrigin, Origins};
 use glam::{Affine3A, DAffine3, DVec3, Mat3A, Mat4, Quat, Vec2, Vec3, Vec3A};
 
 /// Geometry once, in its own rest space (a glTF primitive).
