@@ -5,6 +5,7 @@ use super::small_scene::{STILL, small_scene, still_scene};
 use glam::Vec3;
 use psao_core::Kernel;
 use psao_core::residual::Quantiser;
+use psao_server::camera::Camera;
 use psao_server::encode::{Compression, Encoder, Eye, Limits, Scheme, View, capacity_of};
 use psao_server::scene::Scene;
 use psao_server::world::{Options, World};
@@ -179,7 +180,15 @@ impl Take {
             let view = View {
                 sees: &sees,
                 eye: height_m.map(|height| Eye {
-                    position: Vec3::Y * height,
+                    camera: Camera {
+                        position: Vec3::Y * height,
+                        forward: Vec3::NEG_Y,
+                        up: Vec3::Z,
+                        fov_y_rad: 1.0,
+                        aspect: 1.0,
+                        near: 0.1,
+                        far: 100.0,
+                    },
                     pixels_per_radian: 1000.0,
                 }),
             };

@@ -448,6 +448,7 @@ mod tests {
             .map(|i| Sample {
                 position: [0, 1, 2].map(|k| unit(4 * i + k) * size[k as usize]),
                 normal: normals[(scramble(4 * i + 3) % 5) as usize],
+                stretch: 1.0,
             })
             .collect()
     }
