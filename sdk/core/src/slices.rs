@@ -53,7 +53,7 @@ pub struct Slice {
     pub patch: u32,
     /// Its first point's place in the points' side data.
     pub point_first: u32,
-    /// Points, at most [`SLICE_POINTS`]; 0 while the slice is closed.
+    /// Points, at most [`crate::residual::SLICE_POINTS`]; 0 while the slice is closed.
     pub point_count: u32,
     /// Blocks of [`BLOCK`] points that are in cells, the first in the lowest bit.
     pub shown: u64,
