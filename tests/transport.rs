@@ -914,16 +914,26 @@ fn a_client_that_ends_or_stops_its_stream_is_gone() {
 
 #[test]
 fn when_the_server_ends_its_clients_are_told() {
-    let mut server = Server::start(2);
-    let (mut idle, _) = server.client();
-    let (mut busy, id) = server.client();
-    server.send(id, frame(1, 20_000_000));
-    drop(server.transport);
     let told = Closed::ByServer("the server shut down".into());
-    assert_eq!(closed(&mut idle), (vec![], told.clone()));
-    assert_eq!(closed(&mut busy).1, told);
-    assert_eq!(busy.camera(&camera(0.0)), Err(Unsent::Closed));
-    assert_eq!(busy.transform(&transform(0)), Err(Unsent::Closed));
+    let mut unheard = 0;
+    for _ in 0..3 {
+        let mut server = Server::start(2);
+        let (mut idle, _) = server.client();
+        let (mut busy, id) = server.client();
+        server.send(id, frame(1, 20_000_000));
+        drop(server.transport);
+        let (frames, why) = closed(&mut idle);
+        assert_eq!(frames, vec![]);
+        for why in [why, closed(&mut busy).1] {
+            // The one datagram that says so may be lost, then the client notices the silence.
+            let lost = matches!(why, Closed::Lost(_));
+            assert!(lost || why == told, "{why:?}");
+            unheard += u32::from(lost);
+        }
+        assert_eq!(busy.camera(&camera(0.0)), Err(Unsent::Closed));
+        assert_eq!(busy.transform(&transform(0)), Err(Unsent::Closed));
+    }
+    assert!(unheard < 3, "of 6 clients {unheard} were not told");
 }
 
 #[test]
