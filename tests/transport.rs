@@ -923,7 +923,7 @@ fn when_the_server_ends_its_clients_are_told() {
         server.send(id, frame(1, 20_000_000));
         drop(server.transport);
         let (frames, why) = closed(&mut idle);
-        assert_eq!(frames, vec![]);
+        assert!(frames.is_empty());
         for why in [why, closed(&mut busy).1] {
             // The one datagram that says so may be lost, then the client notices the silence.
             let lost = matches!(why, Closed::Lost(_));
