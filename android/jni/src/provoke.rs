@@ -1,16 +1,13 @@
 //! Only for tests, behind the feature `provoke`: what must never happen, and what Java itself
 //! cannot do.
 
-use crate::client::{psao_client, psao_client_restart, with};
+use crate::client::{psao_client_restart, with};
+use crate::native::at;
 use crate::result::psao_result::PSAO_ERROR_INTERNAL;
 use jni::EnvUnowned;
 use jni::errors::{Error, ThrowRuntimeExAndDefault};
 use jni::objects::{JClass, JObject};
 use jni::sys::{jint, jlong};
-
-fn client(address: jlong) -> *mut psao_client {
-    address as usize as *mut psao_client
-}
 
 /// A panic in a client's function.
 #[unsafe(no_mangle)]
@@ -21,7 +18,7 @@ pub unsafe extern "system" fn Java_org_psao_Provoke_panicOfClient(
     _keep: JObject<'_>,
 ) -> jint {
     // SAFETY: as org.psao.Native's.
-    unsafe { with(client(address), |_| panic!("provoked")) as jint }
+    unsafe { with(at(address), |_| panic!("provoked")) as jint }
 }
 
 /// A panic on the way from Java to it.
@@ -43,7 +40,6 @@ pub unsafe extern "system" fn Java_org_psao_Provoke_restartElsewhere(
     _keep: JObject<'_>,
 ) -> jint {
     // SAFETY: as org.psao.Native's; this thread waits, so that it is still one pusher.
-    let thread =
-        std::thread::spawn(move || unsafe { psao_client_restart(client(address)) as jint });
+    let thread = std::thread::spawn(move || unsafe { psao_client_restart(at(address)) as jint });
     thread.join().unwrap_or(PSAO_ERROR_INTERNAL as jint)
 }
