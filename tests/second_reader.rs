@@ -435,8 +435,7 @@ struct Slice {
     points: Vec<Point>,
     /// 15.8: whether a block's points are in cells.
     shown: Vec<bool>,
-    /// Neighbours for the item that opens it, and for those after.
-    first_earlier: Vec<Vec<usize>>,
+    /// 15.10: neighbours of each point.
     earlier: Vec<Vec<usize>>,
     later: Vec<Vec<usize>>,
 }
@@ -672,8 +671,7 @@ fn open_slice(
         .iter()
         .map(|point| (point.position, point.normal))
         .collect();
-    let (first_earlier, _) = neighbours(&placed, 16);
-    let (earlier, later) = neighbours(&placed, 24);
+    let (earlier, later) = neighbours(&placed);
     Ok(Slice {
         instance,
         numbers,
@@ -687,7 +685,6 @@ fn open_slice(
                 last: 0,
             })
             .collect(),
-        first_earlier,
         earlier,
         later,
     })
@@ -790,7 +787,7 @@ fn begin_patch(data: &[u8]) -> Result<(Patch<'_>, u32, [u32; 3], usize), String>
 /// A patch that is being read.
 struct Patch<'a> {
     coder: Coder<'a>,
-    odds: Tables,
+    odds: Tables<Odds>,
     order: Vec<usize>,
     /// Of each depth.
     state: Vec<usize>,
@@ -827,6 +824,18 @@ impl Patch<'_> {
     }
 
     /// Plain bits, as many as one likes: those above the lowest 16 first.
+    /// 15.11
+    fn symbol(&mut self, row: &[u64]) -> usize {
+        let p = self.range >> 16;
+        let symbol = row.iter().take_while(|n| self.code >= p * **n).count();
+        let start = if symbol == 0 { 0 } else { p * row[symbol - 1] };
+        let end = row.get(symbol).map_or(self.range, |n| p * n);
+        self.code = self.code.wrapping_sub(start);
+        self.range = end - start;
+        self.refill();
+        symbol
+    }
+
     fn plain(&mut self, bits: u32) -> u32 {
         if bits > 16 {
             let above = self.coder.plain(bits - 16);
@@ -1007,9 +1016,8 @@ impl Patch<'_> {
     }
 }
 
-/// 15.10: earlier and later neighbours of points, each a position and a normal's code, among the
-/// `window` before and after each.
-pub fn neighbours(points: &[([u32; 3], u8)], window: usize) -> (Vec<Vec<usize>>, Vec<Vec<usize>>) {
+/// 15.10: earlier and later neighbours of points, each a position and a normal's code.
+pub fn neighbours(points: &[([u32; 3], u8)]) -> (Vec<Vec<usize>>, Vec<Vec<usize>>) {
     let most = u64::from(u32::MAX);
     let normals: Vec<[i64; 3]> = (0..=255).map(normal_steps).collect();
     let distance = |a: usize, b: usize| {
@@ -1039,14 +1047,14 @@ pub fn neighbours(points: &[([u32; 3], u8)], window: usize) -> (Vec<Vec<usize>>,
         found.sort();
         found
             .into_iter()
-            .take(3)
+            .take(2)
             .map(|(_, _, other)| other)
             .collect()
     };
     let (mut earlier, mut later) = (Vec::new(), Vec::new());
     for at in 0..points.len() {
-        earlier.push(nearest(at, (at.saturating_sub(window)..at).collect()));
-        let end = (at + window + 1).min(points.len());
+        earlier.push(nearest(at, (at.saturating_sub(24)..at).collect()));
+        let end = (at + 25).min(points.len());
         later.push(nearest(at, (at + 1..end).collect()));
     }
     (earlier, later)
@@ -1113,9 +1121,15 @@ impl Coder<'_> {
     }
 
     fn decide(&mut self, odds: &mut Odds) -> bool {
-        let bound = (self.range >> 16) * ((odds.0 + odds.1) >> 1);
-        let yes = self.code < bound;
+        let yes = self.decide_known((odds.0 + odds.1) >> 1);
         odds.learn(yes);
+        yes
+    }
+
+    /// 15.11
+    fn decide_known(&mut self, odds: u64) -> bool {
+        let bound = (self.range >> 16) * odds;
+        let yes = self.code < bound;
         if yes {
             self.range = bound;
         } else {
@@ -1124,6 +1138,18 @@ impl Coder<'_> {
         }
         self.refill();
         yes
+    }
+
+    /// 15.11
+    fn symbol(&mut self, row: &[u64]) -> usize {
+        let p = self.range >> 16;
+        let symbol = row.iter().take_while(|n| self.code >= p * **n).count();
+        let start = if symbol == 0 { 0 } else { p * row[symbol - 1] };
+        let end = row.get(symbol).map_or(self.range, |n| p * n);
+        self.code = self.code.wrapping_sub(start);
+        self.range = end - start;
+        self.refill();
+        symbol
     }
 
     fn plain(&mut self, bits: u32) -> u32 {
@@ -1203,11 +1229,10 @@ fn number(data: &[u8], at: usize, bytes: usize) -> u64 {
     })
 }
 
-/// 15.11
-type Tables = HashMap<String, Vec<Vec<Odds>>>;
+/// Tables out of the document itself: rows by their names.
+type Tables<T> = HashMap<String, Vec<Vec<T>>>;
 
-/// Out of the document itself: rows by their names.
-fn tables(title: &str) -> Tables {
+fn tables<T>(title: &str, number: fn(u64) -> T) -> Tables<T> {
     let document = include_str!("../docs/format.md");
     let (_, rest) = document.split_once(&format!("```{title}\n")).expect(title);
     let (lines, _) = rest.split_once("```").expect("the table ends");
@@ -1215,16 +1240,16 @@ fn tables(title: &str) -> Tables {
     for line in lines.lines() {
         let mut words = line.split_whitespace();
         let name = words.next().expect("a row has a name");
-        let row = words.map(|n| Odds::new(n.parse().unwrap())).collect();
+        let row = words.map(|n| number(n.parse().unwrap())).collect();
         tables.entry(name.into()).or_default().push(row);
     }
     tables
 }
 
-/// Of later items, of items that open, and of patches.
-static LATER: LazyLock<Tables> = LazyLock::new(|| tables("odds later items"));
-static OPENING: LazyLock<Tables> = LazyLock::new(|| tables("odds items that open"));
-static PATCH_TABLES: LazyLock<Tables> = LazyLock::new(|| tables("odds patches"));
+/// 15.11: of later items, and of items that open; 15.6: of patches.
+static LATER: LazyLock<Tables<u64>> = LazyLock::new(|| tables("odds later items", |n| n));
+static OPENING: LazyLock<Tables<u64>> = LazyLock::new(|| tables("odds items that open", |n| n));
+static PATCH_TABLES: LazyLock<Tables<Odds>> = LazyLock::new(|| tables("odds patches", Odds::new));
 
 /// What 15.12 keeps of a point during an item.
 #[derive(Clone, Copy)]
@@ -1236,16 +1261,13 @@ struct Moving {
 /// 15.12, 15.13
 fn decode(data: &[u8], opens: bool, step: i64, slice: &mut Slice) -> Result<(), String> {
     let mut coder = Coder::new(data);
-    let mut tables = if opens {
-        OPENING.clone()
-    } else {
-        LATER.clone()
-    };
+    let tables = if opens { &OPENING } else { &LATER };
+    let of_step = step.min(4) as usize - 1;
     let points = &mut slice.points;
     let mut moving: Vec<Moving> = points
         .iter()
         .map(|point| Moving {
-            weight: 7 * point.last,
+            weight: 8 * point.last,
             activity: point.last.abs(),
         })
         .collect();
@@ -1258,15 +1280,19 @@ fn decode(data: &[u8], opens: bool, step: i64, slice: &mut Slice) -> Result<(), 
             3..=5 => 3,
             _ => 4,
         };
-        let row = moved_before + 2 * moved_before_that;
-        let block_odds = tables.get_mut("block").expect("a table");
-        let moves = coder.decide(&mut block_odds[row][column]);
+        let before = moved_before + 2 * moved_before_that;
+        let odds = if opens {
+            tables["block"][0][before]
+        } else {
+            tables["block"][4 * of_step + before][column]
+        };
+        let moves = coder.decide_known(odds);
         moved_before_that = moved_before;
         moved_before = usize::from(moves);
         if !moves {
             for at in block {
                 moving[at] = Moving {
-                    weight: 3 * points[at].last,
+                    weight: 0,
                     activity: 0,
                 };
                 points[at].last = 0;
@@ -1274,38 +1300,47 @@ fn decode(data: &[u8], opens: bool, step: i64, slice: &mut Slice) -> Result<(), 
             continue;
         }
         for at in block {
-            let or_itself = |found: &[usize]| [0, 1, 2].map(|i| *found.get(i).unwrap_or(&at));
+            let or_itself = |found: &[usize]| [0, 1].map(|i| *found.get(i).unwrap_or(&at));
             let point = &mut points[at];
+            let earlier = or_itself(&slice.earlier[at]);
             if opens {
-                let earlier = or_itself(&slice.first_earlier[at]);
-                let weights = earlier.map(|other| moving[other].weight);
-                let dark = (weights.iter().sum::<i64>() * 85 + 128) >> 8;
+                let [a, b] = earlier.map(|other| moving[other].weight);
+                let dark = (a + b + 1) >> 1;
                 let predicted = 255 - dark;
-                let spread = (weights.iter().max().unwrap() - weights.iter().min().unwrap()) >> 1;
-                let a = earlier.map(|other| moving[other].activity).iter().sum();
-                let steps = steps(&mut coder, &mut tables, predicted, a, spread, 0, 0);
-                point.occlusion = (predicted + steps * step).clamp(0, 255);
+                let bits = |number: i64| (64 - number.leading_zeros()) as usize;
+                let row = 9 * bits((a - b).abs() >> 1) + bits(dark);
+                let steps = -steps(&mut coder, &tables["steps"][row]);
+                point.occlusion = (predicted + steps).clamp(0, 255);
                 moving[at] = Moving {
                     weight: 255 - point.occlusion,
-                    activity: (point.occlusion - predicted).abs(),
+                    activity: 0,
                 };
                 continue;
             }
-            let earlier = or_itself(&slice.earlier[at]);
             let later = or_itself(&slice.later[at]);
             let all = || earlier.iter().chain(&later);
-            let sum = all().map(|&other| moving[other].weight).sum::<i64>() + 32;
-            let (change, rounding) = (sum.div_euclid(64), sum.rem_euclid(64));
+            let sum = all().map(|&other| moving[other].weight).sum::<i64>() + 7 * point.last;
+            let change = (sum + 32).div_euclid(64);
             let predicted = (point.occlusion + change).clamp(0, 255);
+            let (way, lies) = match predicted {
+                0 => (1, 2),
+                255 => (-1, 2),
+                _ => {
+                    let way = if sum < 0 { -1 } else { 1 };
+                    (way, usize::from((sum - 64 * change) * way >= 0))
+                }
+            };
             let activity: i64 = all().map(|&other| moving[other].activity).sum();
-            let a = activity + 2 * point.last.abs();
-            let s = change.abs();
-            let steps = steps(&mut coder, &mut tables, predicted, a, s, change, rounding);
+            let activity = activity + 2 * point.last.abs();
+            let starts = [1, 3, 5, 7, 10, 14, 20, 28, 40, 60, 91];
+            let kind = starts.iter().filter(|start| **start <= activity).count();
+            let row = 36 * of_step + 3 * kind + lies;
+            let steps = way * steps(&mut coder, &tables["steps"][row]);
             let becomes = (predicted + steps * step).clamp(0, 255);
             let now = (becomes - point.occlusion).clamp(-127, 127);
             point.occlusion = becomes;
             moving[at] = Moving {
-                weight: 13 * now + 3 * point.last,
+                weight: 17 * now,
                 activity: 2 * now.abs(),
             };
             point.last = now;
@@ -1315,46 +1350,19 @@ fn decode(data: &[u8], opens: bool, step: i64, slice: &mut Slice) -> Result<(), 
 }
 
 /// 15.14
-fn steps(
-    coder: &mut Coder<'_>,
-    tables: &mut Tables,
-    predicted: i64,
-    a: i64,
-    s: i64,
-    c: i64,
-    r: i64,
-) -> i64 {
-    let starts = [1, 3, 5, 7, 10, 14, 20, 28, 40, 60, 91];
-    let kind = starts.iter().filter(|start| **start <= a).count();
-    let size = match s {
-        0..=3 => s as usize,
-        4 => 3,
-        _ => 4,
-    };
-    let mut decide = |name: &str, row: usize, column: usize| {
-        coder.decide(&mut tables.get_mut(name).expect(name)[row][column])
-    };
-    let open = usize::from(predicted == 255);
-    if !decide("some", kind, 2 * size + open) {
-        return 0;
-    }
-    let down = match predicted {
-        0 => false,
-        255 => true,
-        _ => decide("down", (c.clamp(-2, 2) + 2) as usize, (r >> 4) as usize),
-    };
-    let mut magnitude = 1;
-    while magnitude < 15 && decide("more", magnitude as usize - 1, kind) {
-        magnitude += 1;
-    }
-    if magnitude == 15 {
-        let mut rest = 0;
-        for _ in 0..8 {
-            rest = 2 * rest + i64::from(coder.decide(&mut Odds::new(128)));
+fn steps(coder: &mut Coder<'_>, row: &[u64]) -> i64 {
+    let symbol = coder.symbol(row) as u32;
+    match symbol {
+        0 => 0,
+        1..=8 if symbol % 2 == 1 => i64::from(symbol / 2 + 1),
+        1..=8 => -i64::from(symbol / 2),
+        _ => {
+            let bits = symbol - 8;
+            let rest = i64::from(coder.plain(bits + 1));
+            let magnitude = 3 + (1 << bits) + (rest >> 1);
+            if rest & 1 == 1 { -magnitude } else { magnitude }
         }
-        magnitude += rest;
     }
-    if down { -magnitude } else { magnitude }
 }
 
 /// Section 8.

@@ -22,6 +22,7 @@ use psao_core::stream::{
     Writer, flag, kind, write_packet,
 };
 use psao_core::{Bucket, Cell, Instance, Mirror};
+use std::time::Instant;
 use zstd::zstd_safe::{CCtx, CParameter, Strategy, compress_bound};
 
 /// How a stream carries changes.
@@ -98,6 +99,9 @@ pub struct FrameStats {
     pub patch_bytes: u64,
     /// Bytes of the frame in the stream, patches included.
     pub bytes: u64,
+    /// Time for coding and packing, nanoseconds, summed over threads; the rest of the frame's time
+    /// is for finding what the client lacks.
+    pub encode_ns: u64,
 }
 
 /// One client's view of the truth.
@@ -230,9 +234,11 @@ impl Encoder {
             Sent::Cells(sent) => sent.frame(world, view, &mut stats),
             Sent::Residual(sent) => {
                 let frame = sent.frame(world, view, &mut stats);
+                let packing = Instant::now();
                 for body in frame.patches {
                     self.packet(out, kind::PATCHES, 0, body.len(), |w| w.bytes(&body));
                 }
+                stats.encode_ns += packing.elapsed().as_nanos() as u64;
                 stats.patch_bytes = (out.len() - start) as u64;
                 frame.packets
             }
@@ -242,8 +248,10 @@ impl Encoder {
             packets.push((kind::FRAME, 0, Vec::new()));
         }
         if !packets.is_empty() {
+            let packing = Instant::now();
             self.frame_id += 1;
             self.write_frame(&packets, time_ns, out);
+            stats.encode_ns += packing.elapsed().as_nanos() as u64;
         }
         stats.bytes = (out.len() - start) as u64;
         // Frames that send nothing pay for those that sent too much.

@@ -178,8 +178,10 @@ pub struct Row {
     pub decode_ms: f64,
     /// 99th percentile of the same.
     pub decode_p99_ms: f64,
-    /// Median milliseconds of selecting and encoding a frame, on one thread.
+    /// Median milliseconds of coding and packing a frame, on one thread: what compares coders.
     pub encode_ms: f64,
+    /// Median milliseconds of finding what of a frame the client lacks, on one thread.
+    pub select_ms: f64,
     /// Median milliseconds of the world's step, on all threads; shared by all clients.
     pub step_ms: f64,
     /// Rays traced a frame.
@@ -467,6 +469,7 @@ struct StreamFrame {
     slices_bytes: usize,
     topology_bytes: usize,
     encode_ms: f64,
+    select_ms: f64,
     decode_ms: f64,
     rmse_255: f64,
     points: u64,
@@ -502,12 +505,13 @@ impl Stream {
         pool: &ThreadPool,
     ) -> Result<(), String> {
         let (encoder, bytes) = (&mut self.encoder, &mut self.bytes);
-        let encode_ms = pool.install(|| {
+        let (stats, both_ms) = pool.install(|| {
             let start = Instant::now();
             encoder.merge(world);
-            encoder.frame(world, time_ns, sight, true, bytes);
-            ms(start)
+            let stats = encoder.frame(world, time_ns, sight, true, bytes);
+            (stats, ms(start))
         });
+        let encode_ms = stats.encode_ns as f64 * 1e-6;
         let start = Instant::now();
         let (mut rest, mut shown) = (&self.bytes[..], None);
         while !rest.is_empty() {
@@ -544,6 +548,7 @@ impl Stream {
             slices_bytes: packets_bytes(&self.bytes, kind::SLICES)?,
             topology_bytes: packets_bytes(&self.bytes, kind::PATCHES)?,
             encode_ms,
+            select_ms: both_ms - encode_ms,
             decode_ms,
             rmse_255: self
                 .encoder
@@ -603,6 +608,7 @@ impl Stream {
             decode_ms: percentile(&decode, 0.5),
             decode_p99_ms: percentile(&decode, 0.99),
             encode_ms: percentile(&of(&|frame| frame.encode_ms), 0.5),
+            select_ms: percentile(&of(&|frame| frame.select_ms), 0.5),
             points_changed_per_frame: mean(&of(&|frame| frame.points as f64)),
             client_bytes: self.client.memory_bytes(),
             first_frame_bytes: self.frames[0].bytes as u64,
@@ -757,6 +763,7 @@ impl Evaluation {
             "decode ms",
             "p99",
             "encode ms",
+            "select ms",
             "step ms",
             "krays",
             "points",
@@ -783,6 +790,7 @@ impl Evaluation {
                 format!("{:.3}", row.decode_ms),
                 format!("{:.3}", row.decode_p99_ms),
                 format!("{:.3}", row.encode_ms),
+                format!("{:.3}", row.select_ms),
                 format!("{:.1}", row.step_ms),
                 format!("{:.1}", row.rays_per_frame / 1e3),
                 format!("{:.0}", row.points_changed_per_frame),

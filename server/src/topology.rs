@@ -322,7 +322,7 @@ pub struct Topology {
     pub hash: u64,
     patches: u32,
     bytes: u32,
-    /// Of each patch, level, and first item or not: what all encoders find the same.
+    /// Of each patch and level: what all encoders find the same.
     neighbours: Vec<OnceLock<Vec<Neighbours>>>,
 }
 
@@ -345,7 +345,7 @@ impl Topology {
             }
         }
         topology.hash = hash;
-        let kinds = topology.patches as usize * LEVELS as usize * 2;
+        let kinds = topology.patches as usize * LEVELS as usize;
         topology.neighbours = vec![OnceLock::new(); kinds];
         topology.sets = sets;
         topology
@@ -370,12 +370,12 @@ impl Topology {
     }
 
     /// The neighbours of a patch's points of a level, as [`find_neighbours`] finds them.
-    pub fn neighbours(&self, patch: u32, level: u32, first: bool) -> &[Neighbours] {
-        let kind = (patch * LEVELS + level) * 2 + u32::from(first);
+    pub fn neighbours(&self, patch: u32, level: u32) -> &[Neighbours] {
+        let kind = patch * LEVELS + level;
         self.neighbours[kind as usize].get_or_init(|| {
             let points: Vec<PatchPoint> = self.points_of(patch, level).copied().collect();
             let mut neighbours = vec![Neighbours::default(); points.len()];
-            find_neighbours(&points, first, &mut neighbours);
+            find_neighbours(&points, &mut neighbours);
             neighbours
         })
     }

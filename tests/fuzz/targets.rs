@@ -100,7 +100,7 @@ pub fn range_coder(data: &[u8]) {
     let count = decode_patch(patch, &mut points).unwrap_or(100);
     let first = first & 1 != 0;
     let mut neighbours = vec![Neighbours::default(); count];
-    find_neighbours(&points[..count], first, &mut neighbours);
+    find_neighbours(&points[..count], &mut neighbours);
     let (mut value, mut last) = (vec![255; count], vec![0; count]);
     let mut state = SliceState {
         value: &mut value,

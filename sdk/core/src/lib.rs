@@ -30,6 +30,7 @@ pub mod slices;
 pub mod stream;
 pub mod topology;
 pub mod uplink;
+mod usual;
 
 pub use cell::{Bucket, Cell};
 pub use grid::Instance;

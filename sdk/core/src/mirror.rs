@@ -272,13 +272,19 @@ impl<M: Memory> Mirror<M> {
         let capacity = self.capacity();
         let parts = self.memory.parts_mut();
         let (_, _, set) = split_sets(parts.dirty, capacity);
-        let runs = places.chunks(8).zip(values.chunks(8)).zip(last.chunks(8));
+        let runs = places
+            .chunks(64)
+            .zip(values.chunks(64))
+            .zip(last.chunks(64));
         for ((places, values), last) in runs {
-            if last.iter().all(|change| *change == 0) {
-                continue;
-            }
-            let changed = places.iter().zip(values).zip(last);
-            for ((place, value), _) in changed.filter(|(_, change)| **change != 0) {
+            // Which points changed is hard to foretell: a branch for each would cost more.
+            let mut changed = not_zero(last);
+            while changed != 0 {
+                let which = changed.trailing_zeros() as usize;
+                changed &= changed - 1;
+                let (Some(place), Some(value)) = (places.get(which), values.get(which)) else {
+                    break;
+                };
                 let (index, at) = (place >> 3, place & 7);
                 // NOWHERE's place in a cell is one that no cell has.
                 let cell = parts.cells.get_mut(index as usize);
@@ -386,6 +392,25 @@ impl<M: Memory> Mirror<M> {
             Buffer::Cells => (cell_set, cells),
         }
     }
+}
+
+/// Which of up to 64 bytes are not 0: the first in the lowest bit.
+fn not_zero(bytes: &[i8]) -> u64 {
+    const ONES: u64 = u64::from_le_bytes([1; 8]);
+    const LOWER: u64 = u64::from_le_bytes([127; 8]);
+    let mut set = 0;
+    for (at, bytes) in bytes.chunks(8).enumerate() {
+        let mut eight = [0; 8];
+        match bytes.first_chunk() {
+            Some(bytes) => eight = *bytes,
+            None => eight[..bytes.len()].copy_from_slice(bytes),
+        }
+        let word = u64::from_le_bytes(eight.map(|byte| byte as u8));
+        let highest = ((word & LOWER) + LOWER | word) >> 7 & ONES;
+        // Gathers the eight bits in the highest byte.
+        set |= highest.wrapping_mul(0x0102_0408_1020_4080) >> 56 << (8 * at);
+    }
+    set
 }
 
 fn split_sets(dirty: &mut [u64], capacity: Capacity) -> (&mut [u64], &mut [u64], &mut [u64]) {
@@ -518,6 +543,21 @@ mod tests {
             assert_eq!(runs(mirror), [[7, 9]]);
             assert_eq!((mirror.hash(), mirror.recompute_hash()), (0, 0));
         });
+    }
+
+    #[test]
+    fn bytes_that_are_not_zero_are_found_wherever_they_are() {
+        for length in 0..=64 {
+            for at in 0..length {
+                let mut bytes = vec![0i8; length];
+                bytes[at] = [1, -1, 127, -128][at % 4];
+                assert_eq!(not_zero(&bytes), 1 << at);
+                bytes.fill(-128);
+                bytes[at] = 0;
+                let all = u64::MAX >> (64 - length);
+                assert_eq!(not_zero(&bytes), all ^ 1 << at);
+            }
+        }
     }
 
     #[test]

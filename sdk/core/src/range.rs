@@ -1,8 +1,9 @@
-//! The adaptive binary range coder: yes/no decisions as bytes, each at about its information.
+//! The range coder: decisions and symbols as bytes, each at about its information.
 //!
-//! Encoder and decoder do the same integer arithmetic on the same probabilities. A coded run of
-//! decisions has exactly one right length and ending, which [`Decoder::finish`] checks: bytes
-//! that are missing, left over or changed at the end are an error.
+//! Encoder and decoder do the same integer arithmetic on the same probabilities, which are learnt
+//! ([`Odds`]) or known. A coded run has exactly one right length and ending, which
+//! [`Decoder::finish`] checks: bytes that are missing, left over or changed at the end are an
+//! error.
 #![deny(
     clippy::unwrap_used,
     clippy::panic,
@@ -36,9 +37,9 @@ impl Odds {
         }
     }
 
-    /// In 1/65536, never 0 and never 65536.
-    fn yes(self) -> u64 {
-        u64::from(self.fast.midpoint(self.slow))
+    /// In 1/65536, never 0.
+    fn yes(self) -> u16 {
+        self.fast.midpoint(self.slow)
     }
 
     fn learn(&mut self, yes: bool) {
@@ -109,25 +110,44 @@ impl<'a> Encoder<'a> {
 
     /// Writes one decision.
     pub fn bit(&mut self, odds: &mut Odds, yes: bool) {
-        let bound = (self.range >> 16).wrapping_mul(odds.yes());
+        self.decide(odds.yes(), yes);
         odds.learn(yes);
+    }
+
+    /// Writes one decision that is a yes in `odds`/65536 of all cases; 1 to 65535.
+    pub fn decide(&mut self, odds: u16, yes: bool) {
+        let bound = (self.range >> 16).wrapping_mul(u64::from(odds));
         if yes {
             self.range = bound;
         } else {
             self.add(bound);
             self.range = self.range.wrapping_sub(bound);
         }
-        if self.range < NARROW {
-            self.put(4);
-            self.low <<= 32;
-            self.range <<= 32;
-        }
+        self.widen();
+    }
+
+    /// Writes one of `N` + 1 symbols. `below`: in how many of 65536 cases it is the first, one of
+    /// the first two, of the first three, and so on: each more than the one before.
+    #[inline]
+    pub fn symbol<const N: usize>(&mut self, below: &[u16; N], symbol: usize) {
+        let part = self.range >> 16;
+        let start = symbol.checked_sub(1).and_then(|before| below.get(before));
+        let start = start.map_or(0, |start| part.wrapping_mul(u64::from(*start)));
+        let end = below.get(symbol);
+        let end = end.map_or(self.range, |end| part.wrapping_mul(u64::from(*end)));
+        self.add(start);
+        self.range = end.wrapping_sub(start);
+        self.widen();
     }
 
     /// Writes a number of `count` bits, 0 to 16, of which all are equally likely.
     pub fn bits(&mut self, count: u32, value: u32) {
         self.range >>= count;
         self.add(self.range.wrapping_mul(u64::from(value)));
+        self.widen();
+    }
+
+    fn widen(&mut self) {
         if self.range < NARROW {
             self.put(4);
             self.low <<= 32;
@@ -200,9 +220,16 @@ impl<'a> Decoder<'a> {
     /// Reads one decision.
     #[inline(always)]
     pub fn bit(&mut self, odds: &mut Odds) -> bool {
-        let bound = (self.range >> 16).wrapping_mul(odds.yes());
-        let yes = self.code < bound;
+        let yes = self.decide(odds.yes());
         odds.learn(yes);
+        yes
+    }
+
+    /// Reads one decision that is a yes in `odds`/65536 of all cases.
+    #[inline(always)]
+    pub fn decide(&mut self, odds: u16) -> bool {
+        let bound = (self.range >> 16).wrapping_mul(u64::from(odds));
+        let yes = self.code < bound;
         if yes {
             self.range = bound;
         } else {
@@ -213,7 +240,31 @@ impl<'a> Decoder<'a> {
         yes
     }
 
+    /// Reads one of `N` + 1 symbols; `below` as in [`Encoder::symbol`]. It looks for the first
+    /// symbols first, so that these should be the usual ones.
+    #[inline(always)]
+    pub fn symbol<const N: usize>(&mut self, below: &[u16; N]) -> usize {
+        let part = self.range >> 16;
+        let mut start = 0;
+        let mut symbol = 0usize;
+        let mut end = self.range;
+        for below in below {
+            let bound = part.wrapping_mul(u64::from(*below));
+            if self.code < bound {
+                end = bound;
+                break;
+            }
+            start = bound;
+            symbol = symbol.wrapping_add(1);
+        }
+        self.code = self.code.wrapping_sub(start);
+        self.range = end.wrapping_sub(start);
+        self.widen();
+        symbol
+    }
+
     /// Reads a number of `count` bits, 0 to 16, of which all are equally likely.
+    #[inline(always)]
     pub fn bits(&mut self, count: u32) -> u32 {
         self.range >>= count;
         // What the division leaves over belongs to the last number, though no encoder goes there.
@@ -224,6 +275,8 @@ impl<'a> Decoder<'a> {
         value as u32
     }
 
+    // Inlined, like its callers: what is called with the decoder keeps it out of registers.
+    #[inline(always)]
     fn widen(&mut self) {
         if self.range < NARROW {
             let end = self.taken.saturating_add(4);
@@ -255,6 +308,9 @@ impl<'a> Decoder<'a> {
 /// Eight bytes from `at`, zeros past the end.
 fn window(bytes: &[u8], at: usize) -> u64 {
     let rest = bytes.get(at..).unwrap_or_default();
+    if let Some(eight) = rest.first_chunk() {
+        return u64::from_be_bytes(*eight);
+    }
     let mut eight = [0; 8];
     for (to, from) in eight.iter_mut().zip(rest) {
         *to = *from;
@@ -345,6 +401,32 @@ mod tests {
                 let (count, value) = of(i);
                 assert_eq!(decoder.bits(count), value);
                 assert_eq!(decoder.bit(&mut odds), value & 1 != 0);
+            }
+            decoder.finish().unwrap();
+        }
+    }
+
+    #[test]
+    fn symbols_are_read_as_written_however_unlikely() {
+        let rows = [[1, 2, 3], [65533, 65534, 65535], [20000, 40000, 60000]];
+        let mut out = vec![0; 8192];
+        for seed in 0..300u32 {
+            let of = |i: u32| {
+                let mixed = (i ^ seed << 12).wrapping_mul(2654435761);
+                (&rows[mixed as usize % 3], (mixed >> 20) as usize % 4)
+            };
+            let mut encoder = Encoder::new(&mut out);
+            for i in 0..1000 {
+                let (row, symbol) = of(i);
+                encoder.symbol(row, symbol);
+                encoder.decide(60000, symbol == 0);
+            }
+            let length = encoder.finish().unwrap();
+            let mut decoder = Decoder::new(&out[..length]);
+            for i in 0..1000 {
+                let (row, symbol) = of(i);
+                assert_eq!(decoder.symbol(row), symbol);
+                assert_eq!(decoder.decide(60000), symbol == 0);
             }
             decoder.finish().unwrap();
         }

@@ -57,9 +57,6 @@ pub struct Slice {
     pub point_count: u32,
     /// Blocks of [`BLOCK`] points that are in cells, the first in the lowest bit.
     pub shown: u64,
-    /// 1 if its neighbours are those for items after the first.
-    neighbours_known: u32,
-    reserved: u32,
 }
 
 impl Slice {
@@ -211,8 +208,8 @@ impl Slices<'_> {
         Ok(())
     }
 
-    /// Puts a patch's points of a level where [`Slices::open`], [`Slices::prepare`] and
-    /// [`Slices::settle`] look first, for a caller that has them: it spares decoding the patch.
+    /// Puts a patch's points of a level where [`Slices::open`] and [`Slices::settle`] look
+    /// first, for a caller that has them: it spares decoding the patch.
     pub fn lend_points<'b>(
         &mut self,
         patch: u32,
@@ -258,8 +255,8 @@ impl Slices<'_> {
         Ok(kept)
     }
 
-    /// Opens a slice: all its points are open and in no cell. `known`: its neighbours for the
-    /// first item, if the caller has found them before.
+    /// Opens a slice: all its points are open and in no cell. `known`: its neighbours, if the caller
+    /// has found them before.
     ///
     /// # Errors
     /// There is no such slice, or it is open already; its instance has no grid; its patch has not
@@ -283,7 +280,7 @@ impl Slices<'_> {
             patch,
             point_first,
             point_count: count as u32,
-            ..Slice::default()
+            shown: 0,
         };
         let range = opened.range();
         let apart = |other: &Slice| {
@@ -302,7 +299,13 @@ impl Slices<'_> {
         ) else {
             return Err(StreamError::Value);
         };
-        settle_neighbours(points, true, known, neighbours);
+        match known {
+            Some(known) => neighbours
+                .iter_mut()
+                .zip(known)
+                .for_each(|(to, from)| *to = *from),
+            None => find_neighbours(points, neighbours),
+        }
         values.fill(255);
         last.fill(0);
         places.fill(NOWHERE);
@@ -319,32 +322,6 @@ impl Slices<'_> {
         (slice.point_count != 0)
             .then_some(*slice)
             .ok_or(StreamError::Order)
-    }
-
-    /// Makes an open slice ready for an item after its first. `known`: its neighbours for that, if
-    /// the caller has found them before.
-    ///
-    /// # Errors
-    /// None of a slice that was opened.
-    pub fn prepare<M: Memory>(
-        &mut self,
-        mirror: &Mirror<M>,
-        index: u32,
-        known: Option<&[Neighbours]>,
-    ) -> Result<(), StreamError> {
-        let slice = self.get(index)?;
-        if slice.neighbours_known == 0 {
-            if known.is_none() {
-                self.read_points(&grid_of(mirror, slice.instance)?, slice.patch)?;
-            }
-            if let Some(neighbours) = self.neighbours.get_mut(slice.range()) {
-                settle_neighbours(self.scratch, false, known, neighbours);
-            }
-            if let Some(slice) = self.slices.get_mut(index as usize) {
-                slice.neighbours_known = 1;
-            }
-        }
-        Ok(())
     }
 
     /// An open slice's neighbours and state.
@@ -459,19 +436,6 @@ impl Slices<'_> {
     }
 }
 
-/// Copies the neighbours that are known, or finds them; of as many points as there is room for.
-fn settle_neighbours(
-    points: &[PatchPoint],
-    first: bool,
-    known: Option<&[Neighbours]>,
-    out: &mut [Neighbours],
-) {
-    match known {
-        Some(known) => out.iter_mut().zip(known).for_each(|(to, from)| *to = *from),
-        None => find_neighbours(points, first, out),
-    }
-}
-
 fn grid_of<M: Memory>(mirror: &Mirror<M>, instance: u32) -> Result<Instance, StreamError> {
     let grid = mirror.instances().get(instance as usize);
     let grid = grid.filter(|grid| grid.bucket_count > 0);
@@ -552,7 +516,7 @@ pub fn apply_slices<M: Memory>(
                 slices.close(mirror, index)?;
                 continue;
             }
-            _ => slices.prepare(mirror, index, None)?,
+            _ => {}
         }
         let slice = slices.get(index)?;
         let shown = match operation {

@@ -8,6 +8,7 @@ use psao_core::mirror::Capacity;
 use psao_core::stream::{CHANGES_HEADER_BYTES, Writer, apply_changes, kind};
 use psao_core::{Bucket, Cell, Instance, Mirror, Point, dirty, point};
 use rayon::prelude::*;
+use std::time::Instant;
 
 /// Largest content of a frame packet before compression: a client keeps one in memory.
 pub const RAW_BYTES: usize = 1 << 20;
@@ -104,19 +105,24 @@ impl Cells {
         if instances.is_empty() && buckets.is_empty() && cells.is_empty() {
             return Vec::new();
         }
+        let mut start = Instant::now();
         let contents = contents(&instances, &buckets, &cells);
+        stats.encode_ns += start.elapsed().as_nanos() as u64;
         for content in &contents {
             // The same bytes and the same function as at the client; the server's own data
             // always applies.
             apply_changes(content, &mut self.mirror).expect("own changes apply to the mirror");
         }
-        contents
+        start = Instant::now();
+        let packets = contents
             .par_iter()
             .map_init(
                 || compressor(self.compression),
                 |zstd, raw| (kind::FRAME, raw.len(), compress(zstd, raw)),
             )
-            .collect()
+            .collect();
+        stats.encode_ns += start.elapsed().as_nanos() as u64;
+        packets
     }
 
     /// Marks the cells and buckets to send.

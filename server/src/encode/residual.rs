@@ -15,6 +15,7 @@ use psao_core::{Instance, Mirror};
 use rayon::prelude::*;
 use std::collections::{BTreeMap, HashSet};
 use std::ops::Range;
+use std::time::Instant;
 
 /// What a client gets at most.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -119,6 +120,8 @@ struct Coded {
     values: Vec<u8>,
     last: Vec<i8>,
     bytes: Vec<u8>,
+    /// Time that it took.
+    encode_ns: u64,
 }
 
 impl Residual {
@@ -263,7 +266,10 @@ impl Residual {
         self.fades
             .retain(|&index, _| heap[index as usize].point_count > 0);
         stats.closed = out.closes.len() as u32;
-        out.write(self, world, stats)
+        let start = Instant::now();
+        let packets = out.write(self, world, stats);
+        stats.encode_ns += start.elapsed().as_nanos() as u64;
+        packets
     }
 
     /// Marks slices that the picture shows.
@@ -547,9 +553,9 @@ impl Residual {
     ) {
         let level = |slice: &Slice| self.mirror.instances()[slice.instance as usize].level;
         let slice = |lack: &Lack| &world.slices[lack.index as usize];
-        batch.par_iter().for_each(|lack| {
+        batch.par_iter().filter(|lack| lack.opens).for_each(|lack| {
             let (slice, topology) = (slice(lack), &world.topology);
-            topology.neighbours(slice.patch, level(slice), lack.opens);
+            topology.neighbours(slice.patch, level(slice));
         });
         let mut ready: Vec<(u32, Option<[u32; 3]>)> = Vec::new();
         for lack in batch {
@@ -557,13 +563,6 @@ impl Residual {
                 let opens = self.open(world, lack.index, out);
                 ready.extend(opens.map(|opens| (lack.index, Some(opens))));
             } else {
-                let slice = slice(lack);
-                let level = self.mirror.instances()[slice.instance as usize].level;
-                let neighbours = world.topology.neighbours(slice.patch, level, false);
-                let mut slices = self.heap.slices();
-                slices
-                    .prepare(&self.mirror, lack.index, Some(neighbours))
-                    .expect("own slices are open");
                 ready.push((lack.index, None));
             }
         }
@@ -572,6 +571,7 @@ impl Residual {
             .map(|&(index, opens)| self.code(world, index, opens))
             .collect();
         for coded in coded {
+            stats.encode_ns += coded.encode_ns;
             if *room <= 0.0 {
                 stats.waiting += 1;
                 if coded.opens.is_some() {
@@ -666,7 +666,7 @@ impl Residual {
         let mut slices = self.heap.slices();
         let opens = [slice.instance, slice.patch, first];
         slices.lend_points(slice.patch, grid.level, points());
-        let neighbours = world.topology.neighbours(slice.patch, grid.level, true);
+        let neighbours = world.topology.neighbours(slice.patch, grid.level);
         slices
             .open(&self.mirror, index, opens, Some(neighbours))
             .expect("own slices open");
@@ -682,6 +682,7 @@ impl Residual {
             values: self.heap.values(&slice).to_vec(),
             last: self.heap.last(&slice).to_vec(),
             bytes: vec![0; MAX_SLICE_BYTES],
+            encode_ns: 0,
         };
         let mut state = SliceState {
             value: &mut coded.values,
@@ -692,6 +693,7 @@ impl Residual {
         } else {
             self.quantiser
         };
+        let start = Instant::now();
         let length = encode_slice(
             self.heap.neighbours(&slice),
             quantiser,
@@ -701,6 +703,7 @@ impl Residual {
             &mut coded.bytes,
         )
         .expect("a slice has the room asked for");
+        coded.encode_ns = start.elapsed().as_nanos() as u64;
         coded.bytes.truncate(length);
         coded
     }
