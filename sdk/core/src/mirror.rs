@@ -406,7 +406,7 @@ fn not_zero(bytes: &[i8]) -> u64 {
             None => eight[..bytes.len()].copy_from_slice(bytes),
         }
         let word = u64::from_le_bytes(eight.map(|byte| byte as u8));
-        let highest = ((word & LOWER) + LOWER | word) >> 7 & ONES;
+        let highest = (((word & LOWER) + LOWER) | word) >> 7 & ONES;
         // Gathers the eight bits in the highest byte.
         set |= highest.wrapping_mul(0x0102_0408_1020_4080) >> 56 << (8 * at);
     }
