@@ -180,7 +180,7 @@ fn refused(bytes: &[u8]) -> (Refusal, String) {
         scene_hash: SCENE,
     });
     match client.push(bytes) {
-        Err(ClientError::Refused(Some(refusal), text)) => (refusal, text),
+        Err(ClientError::Refused(Some(refusal), words)) => (refusal, words.to_string()),
         other => panic!("{other:?} instead of a refusal"),
     }
 }
