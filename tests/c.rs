@@ -1,10 +1,10 @@
 //! libpsao as C and C++ programs get it: installed to a prefix, linked, and used.
 
+mod one_client;
+
 use clap::Parser;
-use psao_core::mirror::Capacity;
+use one_client::OneClient;
 use psao_server::commands::{RecordArgs, record};
-use psao_server::identity::Identity;
-use psao_server::transport::{Event, OwnedMessage, Transport, TransportConfig};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::LazyLock;
@@ -258,44 +258,13 @@ fn a_c_program_connects_plays_what_comes_and_is_heard() {
         .args(["-lpthread", "-ldl", "-lm", "-o"])
         .arg(&program));
     let stream = root().join("tests/conformance/streams/cells.psao");
-    let identity = Identity::load_or_create(folder.path()).unwrap();
-    let fingerprint = identity.fingerprint().to_string();
-    let mut server = Transport::start(TransportConfig {
-        listen: "127.0.0.1:0".parse().unwrap(),
-        identity,
-        token: "open sesame".into(),
-        max_clients: 1,
-        scene_hash: 0,
-        capacity: Capacity::default(),
-    })
-    .unwrap();
+    let server = OneClient::start(std::fs::read(&stream).unwrap());
     let mut client = Command::new(&program)
-        .arg(server.local_addr().to_string())
-        .args([&fingerprint, "open sesame"])
+        .args([&server.address, &server.fingerprint, one_client::TOKEN])
         .arg(&stream)
         .spawn()
         .unwrap();
-    let mut heard = Vec::new();
-    let ended = loop {
-        for event in server.events() {
-            match event {
-                Event::Joined(id, _) => server.send(id, std::fs::read(&stream).unwrap()),
-                Event::Message(_, OwnedMessage::Ack(frame)) => {
-                    heard.push(format!("frame {frame}"));
-                }
-                Event::Message(_, message) => heard.push(format!("{message:?}")),
-                Event::Left(..) => {}
-            }
-            // An acknowledgement may overtake what was said before it.
-            if heard.len() == 2 {
-                server.close();
-            }
-        }
-        if let Some(ended) = client.try_wait().unwrap() {
-            break ended;
-        }
-        std::thread::sleep(std::time::Duration::from_millis(1));
-    };
+    let (ended, mut heard) = server.until(2, || client.try_wait().unwrap());
     assert!(ended.success(), "{heard:?}");
     assert_eq!(heard.len(), 2, "{heard:?}");
     heard.sort();
