@@ -1,10 +1,10 @@
 //! libpsao as C and C++ programs get it: installed to a prefix, linked, and used.
 
+mod one_client;
+
 use clap::Parser;
-use psao_core::mirror::Capacity;
+use one_client::OneClient;
 use psao_server::commands::{RecordArgs, record};
-use psao_server::identity::Identity;
-use psao_server::transport::{Event, OwnedMessage, Transport, TransportConfig};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::LazyLock;
@@ -133,11 +133,20 @@ fn wrong_use_and_damage_are_harmless_under_sanitizers_and_valgrind() {
 }
 
 #[test]
-fn nothing_is_allocated_between_init_and_the_end_of_300_frames() {
+fn nothing_is_allocated_between_init_and_the_end_of_300_frames_nor_when_a_stream_fails() {
     let setup = &*SETUP;
     let program = setup.compile("cc", "tests/c/quiet.c", &["-std=c11"]);
-    let report = run(Command::new(program).args(&setup.recordings));
-    assert_eq!(report.matches(", 0 calls of").count(), 4, "{report}");
+    let folder = root().join("tests/conformance/streams");
+    let index = std::fs::read_to_string(folder.join("index.txt")).unwrap();
+    let fail = index.lines().filter_map(|line| {
+        let name = line.strip_prefix("invalid ")?.split(' ').nth(1)?;
+        Some(folder.join(format!("{name}.psao")))
+    });
+    let report = run(Command::new(program)
+        .args(&setup.recordings)
+        .arg("fail")
+        .args(fail));
+    assert_eq!(report.matches(", 0 calls of").count(), 5, "{report}");
 }
 
 #[test]
@@ -193,23 +202,46 @@ fn any_implementation_of_the_header_can_be_checked_with_the_conformance_streams(
     }
 }
 
-/// The library with the feature `quic`, as this profile builds it.
-fn with_quic() -> PathBuf {
-    let messages = run(Command::new(env!("CARGO")).current_dir(root()).args([
-        "build",
-        "--locked",
-        "-p",
-        "psao-ffi",
-        "--features",
-        "quic",
-        "--message-format",
-        "json",
-    ]));
+/// libpsao.a, built in another way than it is installed.
+fn library(words: &[&str]) -> PathBuf {
+    let messages = run(Command::new(env!("CARGO"))
+        .current_dir(root())
+        .args(["build", "--locked", "--message-format", "json"])
+        .args(["-p", "psao-ffi"])
+        .args(words));
     let mut paths = messages.split('"');
     paths
         .rfind(|part| part.ends_with("/libpsao.a"))
         .unwrap()
         .into()
+}
+
+#[test]
+fn a_defect_ends_one_function_and_neither_the_program_nor_other_clients() {
+    // The same profile: not while that is being installed.
+    let setup = &*SETUP;
+    let small = ["--profile", "libpsao", "--no-default-features"];
+    let library = library(&[&small[..], &["--features", "thin,provoke"]].concat());
+    for (name, words) in [
+        ("plain", &["-std=c99"][..]),
+        ("sanitized", &["-fsanitize=address,undefined"]),
+        ("threads", &["-fsanitize=thread"]),
+    ] {
+        let program = setup.folder.join(format!("defects-{name}"));
+        run(Command::new("cc")
+            .args(WARNINGS)
+            .args(words)
+            .arg("-I")
+            .arg(root().join("include"))
+            .arg(root().join("tests/c/defects.c"))
+            .arg(&library)
+            .args(["-lpthread", "-o"])
+            .arg(&program));
+        for stream in ["cells", "residual"] {
+            let stream = root().join(format!("tests/conformance/streams/{stream}.psao"));
+            run(Command::new(&program).arg(stream));
+        }
+    }
 }
 
 #[test]
@@ -222,48 +254,17 @@ fn a_c_program_connects_plays_what_comes_and_is_heard() {
         .arg("-I")
         .arg(root().join("include"))
         .arg(root().join("tests/c/connect.c"))
-        .arg(with_quic())
+        .arg(library(&["--features", "quic"]))
         .args(["-lpthread", "-ldl", "-lm", "-o"])
         .arg(&program));
     let stream = root().join("tests/conformance/streams/cells.psao");
-    let identity = Identity::load_or_create(folder.path()).unwrap();
-    let fingerprint = identity.fingerprint().to_string();
-    let mut server = Transport::start(TransportConfig {
-        listen: "127.0.0.1:0".parse().unwrap(),
-        identity,
-        token: "open sesame".into(),
-        max_clients: 1,
-        scene_hash: 0,
-        capacity: Capacity::default(),
-    })
-    .unwrap();
+    let server = OneClient::start(std::fs::read(&stream).unwrap());
     let mut client = Command::new(&program)
-        .arg(server.local_addr().to_string())
-        .args([&fingerprint, "open sesame"])
+        .args([&server.address, &server.fingerprint, one_client::TOKEN])
         .arg(&stream)
         .spawn()
         .unwrap();
-    let mut heard = Vec::new();
-    let ended = loop {
-        for event in server.events() {
-            match event {
-                Event::Joined(id, _) => server.send(id, std::fs::read(&stream).unwrap()),
-                Event::Message(_, OwnedMessage::Ack(frame)) => {
-                    heard.push(format!("frame {frame}"));
-                }
-                Event::Message(_, message) => heard.push(format!("{message:?}")),
-                Event::Left(..) => {}
-            }
-            // An acknowledgement may overtake what was said before it.
-            if heard.len() == 2 {
-                server.close();
-            }
-        }
-        if let Some(ended) = client.try_wait().unwrap() {
-            break ended;
-        }
-        std::thread::sleep(std::time::Duration::from_millis(1));
-    };
+    let (ended, mut heard) = server.until(2, || client.try_wait().unwrap());
     assert!(ended.success(), "{heard:?}");
     assert_eq!(heard.len(), 2, "{heard:?}");
     heard.sort();
@@ -355,9 +356,34 @@ fn the_shared_library_exports_the_listed_functions_and_nothing_else() {
     symbols.sort_unstable();
     let listed = include_str!("../sdk/ffi/exports.txt");
     assert_eq!(symbols, listed.lines().collect::<Vec<_>>());
-    // As the guide says: 403 KiB on x86_64.
+}
+
+#[test]
+fn the_shared_library_is_small_and_knows_no_function_that_takes_memory() {
+    let library = SETUP.prefix.join("lib/libpsao.so");
+    // As the guide says: 149 KiB on x86_64.
     let bytes = std::fs::metadata(&library).unwrap().len();
-    assert!(bytes < 440 << 10, "{bytes} bytes");
+    assert!(bytes < 165 << 10, "{bytes} bytes");
+    let needed = run(Command::new("nm").args(["-D", "-u", "-j"]).arg(&library));
+    let known = [
+        "__cxa_finalize",
+        "_longjmp",
+        "_setjmp",
+        "abort",
+        "bcmp",
+        // zstd's, of a decoder that is not in the caller's memory.
+        "free",
+        "memcpy",
+        "memmove",
+        "memset",
+    ];
+    for name in needed.lines() {
+        let name = name.split('@').next().unwrap();
+        // Weak ones of the compiler's and of zstd's tracing.
+        let weak = ["_ITM_", "__gmon_start__", "ZSTD_trace_"];
+        let weak = weak.iter().any(|start| name.starts_with(start));
+        assert!(weak || known.contains(&name), "it needs {name}");
+    }
 }
 
 #[test]

@@ -3,6 +3,7 @@
 //!
 //! Waits end with what they wait for; their limits are only there to fail instead of hanging.
 
+mod one_client;
 mod small_scene;
 
 use glam::{Affine3A, DAffine3, DVec3, Quat, Vec3};
@@ -12,6 +13,7 @@ use psao::core::uplink::{Camera, Transform};
 use psao::core::{Cell, Kernel};
 use psao::quic::{Closed, Connect, Connection, Fingerprint, Trust};
 use psao::{Client, ClientError, Config, State};
+use psao_server::commands::{PlayArgs, play};
 use psao_server::encode::{Compression, Scheme, capacity_of};
 use psao_server::identity::Identity;
 use psao_server::scene::Scene;
@@ -555,4 +557,32 @@ fn nothing_is_sent_of_what_is_out_of_view_and_it_comes_when_it_is_seen() {
         "nothing moved meanwhile"
     );
     assert!(link.rmse(&served) <= f64::from(THRESHOLD));
+}
+
+#[test]
+fn a_player_says_that_its_server_shut_down_and_takes_that_for_no_failure() {
+    #[derive(clap::Parser)]
+    struct Words {
+        #[command(flatten)]
+        args: PlayArgs,
+    }
+    let cut = concat!(
+        env!("CARGO_MANIFEST_DIR"),
+        "/conformance/streams/cut-off.psao"
+    );
+    let told = || {
+        // A stream without an end, as a live one.
+        let server = one_client::OneClient::start(std::fs::read(cut).unwrap());
+        let (address, fingerprint) = (server.address.clone(), server.fingerprint.clone());
+        let player = std::thread::spawn(move || {
+            let words = ["play", &address, "--token", one_client::TOKEN];
+            let words = words.into_iter().chain(["--fingerprint", &fingerprint]);
+            play(&<Words as clap::Parser>::parse_from(words).args)
+        });
+        server.until(1, || player.is_finished().then_some(()));
+        player.join().unwrap()
+    };
+    let row = ("end".to_string(), "the server shut down".to_string());
+    // The one datagram that says so may be lost.
+    assert!((0..3).any(|_| told().is_ok_and(|table| table.contains(&row))));
 }

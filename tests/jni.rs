@@ -1,9 +1,9 @@
 //! The Java API through JNI, in a Java virtual machine that checks every use of it
 //! (`-Xcheck:jni`): whatever it says fails the test. `tests/jni/Checks.java` has the promises.
 
-use psao_core::mirror::Capacity;
-use psao_server::identity::Identity;
-use psao_server::transport::{Event, OwnedMessage, Transport, TransportConfig};
+mod one_client;
+
+use one_client::OneClient;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::LazyLock;
@@ -209,48 +209,16 @@ fn a_call_through_jni_costs_nanoseconds_more_than_in_c() {
 
 #[test]
 fn a_java_program_connects_plays_what_comes_and_is_heard() {
-    let folder = tempfile::tempdir().unwrap();
-    let stream = streams().join("cells.psao");
-    let identity = Identity::load_or_create(folder.path()).unwrap();
-    let fingerprint = identity.fingerprint().to_string();
-    let mut server = Transport::start(TransportConfig {
-        listen: "127.0.0.1:0".parse().unwrap(),
-        identity,
-        token: "open sesame".into(),
-        max_clients: 1,
-        scene_hash: 0,
-        capacity: Capacity::default(),
-    })
-    .unwrap();
+    let stream = std::fs::read(streams().join("cells.psao")).unwrap();
+    let server = OneClient::start(stream);
     let mut client = java("org.psao.Checks");
     client
         .arg("connects")
         .arg(streams())
-        .arg(server.local_addr().to_string())
-        .args([&fingerprint, "open sesame"])
+        .args([&server.address, &server.fingerprint, one_client::TOKEN])
         .stdout(std::process::Stdio::piped());
     let mut client = client.spawn().unwrap();
-    let mut heard = Vec::new();
-    let ended = loop {
-        for event in server.events() {
-            match event {
-                Event::Joined(id, _) => server.send(id, std::fs::read(&stream).unwrap()),
-                Event::Message(_, OwnedMessage::Ack(frame)) => {
-                    heard.push(format!("frame {frame}"));
-                }
-                Event::Message(_, message) => heard.push(format!("{message:?}")),
-                Event::Left(..) => {}
-            }
-            // An acknowledgement may overtake what was said before it.
-            if heard.len() == 2 {
-                server.close();
-            }
-        }
-        if let Some(ended) = client.try_wait().unwrap() {
-            break ended;
-        }
-        std::thread::sleep(std::time::Duration::from_millis(1));
-    };
+    let (ended, mut heard) = server.until(2, || client.try_wait().unwrap());
     assert!(ended.success(), "{heard:?}");
     let report = std::io::read_to_string(client.stdout.unwrap()).unwrap();
     assert_eq!(report, "connects: passed\n");

@@ -180,7 +180,7 @@ fn refused(bytes: &[u8]) -> (Refusal, String) {
         scene_hash: SCENE,
     });
     match client.push(bytes) {
-        Err(ClientError::Refused(Some(refusal), text)) => (refusal, text),
+        Err(ClientError::Refused(Some(refusal), words)) => (refusal, words.to_string()),
         other => panic!("{other:?} instead of a refusal"),
     }
 }
@@ -914,7 +914,7 @@ fn a_client_that_ends_or_stops_its_stream_is_gone() {
 
 #[test]
 fn when_the_server_ends_its_clients_are_told() {
-    let told = Closed::ByServer("the server shut down".into());
+    let told = Closed::Done("the server shut down".into());
     let mut unheard = 0;
     for _ in 0..3 {
         let mut server = Server::start(2);

@@ -274,6 +274,7 @@ pub fn play(args: &PlayArgs) -> Result<Table, String> {
         first_ns: 0,
         last: Frame::default(),
         decode: Vec::new(),
+        end: None,
     };
     if let Some(topology) = &args.topology {
         player.file(topology)?;
@@ -325,6 +326,8 @@ struct Player {
     last: Frame,
     /// Milliseconds of decoding a frame.
     decode: Vec<f64>,
+    /// Why a live server went, if nothing is wrong with that.
+    end: Option<String>,
 }
 
 impl Player {
@@ -377,6 +380,10 @@ impl Player {
             match connection.receive_timeout(&mut received, Duration::from_secs(1)) {
                 Ok(_) => {}
                 Err(Closed::Ended) => break,
+                Err(Closed::Done(why)) => {
+                    self.end = Some(why);
+                    break;
+                }
                 Err(closed) => return Err(closed.to_string()),
             }
             // A lost acknowledgement is made up for by the next.
@@ -434,7 +441,8 @@ impl Player {
             .copied()
             .unwrap_or(0.0);
         let row = |what: &str, value: String| (what.to_string(), value);
-        vec![
+        let end = self.end.take().map(|why| row("end", why));
+        let rows = vec![
             row(
                 "frames",
                 format!("{} ({} snapshots)", stats.frames, stats.snapshots),
@@ -458,36 +466,49 @@ impl Player {
                 "client's memory",
                 format!("{:.1} MB", self.client.memory_bytes() as f64 / 1e6),
             ),
-        ]
+        ];
+        end.into_iter().chain(rows).collect()
     }
 }
 
-/// Prints what is in a recording, a line a frame.
+/// Prints what is in a recording, a line a frame, while it reads it.
 ///
 /// # Errors
 /// The file is no recording, or is damaged (where).
 pub fn inspect(args: &InspectArgs, out: &mut dyn Write) -> Result<(), String> {
     let name = args.file.display();
-    let bytes = std::fs::read(&args.file).map_err(|error| unreadable(&args.file, &error))?;
-    let at = |rest: &[u8]| bytes.len() - rest.len();
-    let fail = |rest: &[u8], error: &dyn std::fmt::Display| {
-        format!("{name}: at byte {}: {error}", at(rest))
-    };
-    let mut rest = bytes
-        .strip_prefix(&PREAMBLE)
-        .ok_or_else(|| fail(&bytes, &StreamError::NotAStream))?;
+    let unreadable = |error| unreadable(&args.file, &error);
+    let file = File::open(&args.file).map_err(unreadable)?;
+    let more = |bytes: &mut Vec<u8>| (&file).take(1 << 16).read_to_end(bytes);
     let print = |out: &mut dyn Write, line: String| {
         writeln!(out, "{line}").map_err(|error| format!("standard output: {error}"))
     };
+    // What was read of the file, from `at` on; `used` of it are done with.
+    let (mut bytes, mut at, mut used) = (Vec::new(), 0, 0);
+    more(&mut bytes).map_err(unreadable)?;
+    if !bytes.starts_with(&PREAMBLE) {
+        return Err(format!("{name}: at byte 0: {}", StreamError::NotAStream));
+    }
+    used += PREAMBLE.len();
     let (mut packets, mut frame_bytes) = (0, 0);
-    while !rest.is_empty() {
-        let read = Packet::read(rest, MAX_BODY_BYTES).map_err(|error| fail(rest, &error))?;
+    loop {
+        let fail =
+            |error: &dyn std::fmt::Display| format!("{name}: at byte {}: {error}", at + used);
+        let read = Packet::read(&bytes[used..], MAX_BODY_BYTES).map_err(|error| fail(&error))?;
         let Some((packet, length)) = read else {
-            return Err(fail(rest, &"the recording breaks off"));
+            let left = bytes.len() - used;
+            let breaks_off = fail(&"the recording breaks off");
+            bytes.drain(..used);
+            at += used;
+            used = 0;
+            if more(&mut bytes).map_err(unreadable)? > 0 {
+                continue;
+            }
+            return if left == 0 { Ok(()) } else { Err(breaks_off) };
         };
         match packet.kind {
             kind::HEADER => {
-                let header = Header::read(packet.body).map_err(|error| fail(rest, &error))?;
+                let header = Header::read(packet.body).map_err(|error| fail(&error))?;
                 print(out, format!("{header:#?}"))?;
                 print(
                     out,
@@ -495,7 +516,7 @@ pub fn inspect(args: &InspectArgs, out: &mut dyn Write) -> Result<(), String> {
                 )?;
             }
             kind::FRAME | kind::SLICES => {
-                let (frame, _) = Frame::read(packet.body).map_err(|error| fail(rest, &error))?;
+                let (frame, _) = Frame::read(packet.body).map_err(|error| fail(&error))?;
                 packets += 1;
                 frame_bytes += length;
                 if packet.flags & flag::LAST != 0 {
@@ -527,7 +548,6 @@ pub fn inspect(args: &InspectArgs, out: &mut dyn Write) -> Result<(), String> {
                 format!("packet of unknown kind {other}, {length} bytes"),
             )?,
         }
-        rest = &rest[length..];
+        used += length;
     }
-    Ok(())
 }

@@ -8,9 +8,10 @@
 
 enum { PASSES = 5, MOST = 4096 };
 
+/* Of this thread's processor time: what else the machine does hardly shows. */
 static double now_s(void) {
     struct timespec now;
-    clock_gettime(CLOCK_MONOTONIC, &now);
+    clock_gettime(CLOCK_THREAD_CPUTIME_ID, &now);
     return (double)now.tv_sec + (double)now.tv_nsec * 1e-9;
 }
 

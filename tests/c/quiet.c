@@ -1,6 +1,7 @@
 /* Nothing takes memory from the heap between a client's init and the end of its recording: every
- * allocation function of the program and its libraries is this file's, and counts.
- * Arguments: recordings. */
+ * allocation function of the program and its libraries is this file's, and counts. Nor does a
+ * stream that fails take any.
+ * Arguments: recordings; then "fail", and streams that do. */
 #define _GNU_SOURCE
 #include "common.h"
 #include <dlfcn.h>
@@ -88,6 +89,38 @@ static void play(bytes stream, uint32_t two_threads) {
     free(made.block);
 }
 
+/* Into a client with room for any of them. */
+static void fail(int count, char **words) {
+    psao_config config;
+    memset(&config, 0, sizeof config);
+    config.struct_size = sizeof config;
+    config.instance_count = 256, config.bucket_count = 1 << 14, config.cell_count = 1 << 15;
+    config.slice_count = 1 << 10, config.point_count = 1 << 16, config.patch_count = 1 << 10;
+    config.topology_bytes = 1 << 20;
+    owned made = make(&config);
+    long taken = 0;
+    for (int word = 0; word < count; word++) {
+        bytes stream = read_file(words[word]);
+        long before = calls;
+        GIVES(PSAO_OK, psao_client_restart(made.client));
+        psao_result result = PSAO_OK;
+        for (size_t done = 0, used = 0; result >= 0; done += used) {
+            CHECK(done < stream.size);
+            size_t left = stream.size - done;
+            result = psao_client_push(made.client, stream.data + done, left, 0, &used);
+        }
+        char text[513];
+        size_t length = 0;
+        GIVES(PSAO_OK, psao_client_error_text(made.client, text, sizeof text, &length));
+        CHECK(length > 0);
+        taken += calls - before;
+        free(stream.data);
+    }
+    printf("%d streams failed, %ld calls of allocation functions\n", count, taken);
+    CHECK(taken == 0);
+    free(made.block);
+}
+
 int main(int count, char **words) {
     CHECK(count > 1);
     long before = calls;
@@ -96,6 +129,10 @@ int main(int count, char **words) {
     free(probe);
     CHECK(calls == before + 2);
     for (int word = 1; word < count; word++) {
+        if (strcmp(words[word], "fail") == 0) {
+            fail(count - word - 1, words + word + 1);
+            break;
+        }
         bytes stream = read_file(words[word]);
         play(stream, 0);
         play(stream, 1);

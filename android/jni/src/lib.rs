@@ -10,6 +10,8 @@
 
 #![allow(non_camel_case_types)]
 
+#[path = "../../../sdk/ffi/src/border.rs"]
+pub mod border;
 #[path = "../../../sdk/ffi/src/client.rs"]
 pub mod client;
 #[cfg(feature = "quic")]

@@ -10,6 +10,7 @@ use psao_core::stream::{
 };
 
 /// What a client may use at most.
+#[cfg(feature = "std")]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Config {
     /// Most room of each kind; a stream that needs more is refused before memory is taken.
@@ -19,7 +20,7 @@ pub struct Config {
 }
 
 /// Why a push failed.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ClientError {
     /// The bytes are no stream this client can follow.
     Stream(StreamError),
@@ -32,7 +33,7 @@ pub enum ClientError {
     /// A frame's content is not one zstd frame of the size that it says.
     Compression,
     /// The server will not serve; the text is the server's.
-    Refused(Option<Refusal>, String),
+    Refused(Option<Refusal>, Words),
     /// An earlier push failed; call [`Client::restart`].
     Failed,
 }
@@ -43,8 +44,8 @@ impl From<StreamError> for ClientError {
     }
 }
 
-impl std::fmt::Display for ClientError {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+impl core::fmt::Display for ClientError {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
         match self {
             ClientError::Stream(error) => write!(f, "{error}"),
             ClientError::Capacity(needed) => write!(
@@ -75,7 +76,42 @@ impl std::fmt::Display for ClientError {
     }
 }
 
-impl std::error::Error for ClientError {}
+impl core::error::Error for ClientError {}
+
+/// The words of a server, for a person: printable, at most 200 bytes of UTF-8.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Words {
+    bytes: [u8; 200],
+    length: usize,
+}
+
+impl Words {
+    /// What of this is UTF-8 and printable, as far as there is room.
+    fn of(text: &[u8]) -> Words {
+        let mut words = Words {
+            bytes: [0; 200],
+            length: 0,
+        };
+        let valid = text.utf8_chunks().flat_map(|chunk| chunk.valid().chars());
+        for character in valid.filter(|c| !c.is_control()) {
+            let Some(room) = words.bytes[words.length..].get_mut(..character.len_utf8()) else {
+                break;
+            };
+            character.encode_utf8(room);
+            words.length += character.len_utf8();
+        }
+        words
+    }
+}
+
+impl core::fmt::Display for Words {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        for chunk in self.bytes[..self.length].utf8_chunks() {
+            f.write_str(chunk.valid())?;
+        }
+        Ok(())
+    }
+}
 
 /// Where a client is in its stream.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -174,6 +210,7 @@ struct Decoder {
 
 impl Client {
     /// A client that has received nothing, with memory from the heap.
+    #[cfg(feature = "std")]
     pub fn new(config: Config) -> Client {
         let limits = Limits::of_any(config.capacity);
         Client::from(&mut Source::Heap, limits, config.scene_hash)
@@ -229,7 +266,7 @@ impl Client {
         Client::from(&mut source, limits, 0);
         match source {
             Source::Measure(lines) => lines,
-            Source::Heap | Source::Lent(_) => 0,
+            _ => 0,
         }
     }
 
@@ -447,9 +484,7 @@ impl Decoder {
             (kind::REFUSE, None) => {
                 let mut body = Reader(packet.body);
                 let refusal = Refusal::from_code(body.u16()?);
-                let text = String::from_utf8_lossy(body.0);
-                let printable = text.chars().filter(|c| !c.is_control());
-                Err(ClientError::Refused(refusal, printable.take(200).collect()))
+                Err(ClientError::Refused(refusal, Words::of(body.0)))
             }
             (kind::HEADER..=kind::PATCHES, _) => Err(StreamError::Order.into()),
             (_, None) => Err(StreamError::Order.into()),
@@ -479,8 +514,8 @@ impl Decoder {
             self.slices.slices().forget_patches();
         }
         if self.room != need.capacity {
-            let empty = Mirror::new(Heap::default());
-            let mut memory = std::mem::replace(&mut self.mirror, empty).into_memory();
+            let empty = Mirror::new(Heap::empty());
+            let mut memory = core::mem::replace(&mut self.mirror, empty).into_memory();
             memory.resize_changed(need.capacity);
             self.mirror = Mirror::new(memory);
             self.slices.resize(need.capacity);

@@ -7,11 +7,14 @@
 //! [`Client`] does no input or output and has no thread and no clock: whoever has the bytes, from
 //! a socket or a recording, pushes them. With the feature `quic`, [`quic`] fetches them from a
 //! server.
+#![cfg_attr(not(feature = "std"), no_std)]
 
 mod client;
 pub mod memory;
 #[cfg(feature = "quic")]
 pub mod quic;
 
-pub use client::{Client, ClientError, Config, Pushed, State, Stats};
+#[cfg(feature = "std")]
+pub use client::Config;
+pub use client::{Client, ClientError, Pushed, State, Stats, Words};
 pub use psao_core as core;

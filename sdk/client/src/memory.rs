@@ -5,6 +5,7 @@
 //! pieces measures the block, cuts it up and takes the heap's share.
 
 use bytemuck::{Pod, Zeroable};
+use core::ops::{Deref, DerefMut};
 use psao_core::bins::Place;
 use psao_core::mirror::{Capacity, Memory, Parts, PartsMut};
 use psao_core::residual::Neighbours;
@@ -12,7 +13,6 @@ use psao_core::slices::{Patch, Slice, Slices};
 use psao_core::stream::{Header, MAX_BODY_BYTES, MAX_RAW_BYTES};
 use psao_core::topology::{PATCH_POINTS, PatchPoint};
 use psao_core::{Bucket, Cell, Instance, dirty};
-use std::ops::{Deref, DerefMut};
 
 /// 64 bytes, a cache line: what lent memory is made of. Every piece begins with one.
 #[repr(C, align(64))]
@@ -61,6 +61,7 @@ impl Limits {
 #[derive(Debug)]
 pub enum Source {
     /// The heap. Pieces are empty until they are given a length.
+    #[cfg(feature = "std")]
     Heap,
     /// A block that is cut up from its front.
     Lent(&'static mut [Line]),
@@ -78,16 +79,17 @@ impl Source {
             .saturating_mul(size_of::<T>() as u64)
             .div_ceil(size_of::<Line>() as u64);
         match self {
+            #[cfg(feature = "std")]
             Source::Heap => Piece {
                 memory: Store::Heap(Vec::new()),
                 length: 0,
             },
             Source::Measure(total) => {
                 *total = total.saturating_add(lines);
-                Source::Heap.piece(0)
+                Piece::empty()
             }
             Source::Lent(block) => {
-                let (piece, rest) = std::mem::take(block).split_at_mut(lines as usize);
+                let (piece, rest) = core::mem::take(block).split_at_mut(lines as usize);
                 *block = rest;
                 let bytes: &mut [u8] = bytemuck::cast_slice_mut(piece);
                 let whole = bytes.len() / size_of::<T>() * size_of::<T>();
@@ -110,11 +112,20 @@ pub struct Piece<T: 'static> {
 
 #[derive(Debug)]
 enum Store<T: 'static> {
+    #[cfg(feature = "std")]
     Heap(Vec<T>),
     Lent(&'static mut [T]),
 }
 
 impl<T: Pod> Piece<T> {
+    /// Nothing, with no room for more.
+    fn empty() -> Piece<T> {
+        Piece {
+            memory: Store::Lent(&mut []),
+            length: 0,
+        }
+    }
+
     /// Makes it `length` elements, all zero. From the heap, memory is taken anew; a lent piece
     /// must have room.
     ///
@@ -122,6 +133,7 @@ impl<T: Pod> Piece<T> {
     /// If a lent piece has no room: lengths are checked against [`Limits`] before.
     pub fn resize_zeroed(&mut self, length: usize) {
         match &mut self.memory {
+            #[cfg(feature = "std")]
             Store::Heap(elements) => {
                 // The old one goes first, so that both are never held at once.
                 *elements = Vec::new();
@@ -143,6 +155,7 @@ impl<T> Deref for Piece<T> {
 
     fn deref(&self) -> &[T] {
         match &self.memory {
+            #[cfg(feature = "std")]
             Store::Heap(elements) => elements,
             Store::Lent(elements) => &elements[..self.length],
         }
@@ -152,12 +165,14 @@ impl<T> Deref for Piece<T> {
 impl<T> DerefMut for Piece<T> {
     fn deref_mut(&mut self) -> &mut [T] {
         match &mut self.memory {
+            #[cfg(feature = "std")]
             Store::Heap(elements) => elements,
             Store::Lent(elements) => &mut elements[..self.length],
         }
     }
 }
 
+#[cfg(feature = "std")]
 impl<T: Pod> Clone for Piece<T> {
     /// A copy on the heap.
     fn clone(&self) -> Piece<T> {
@@ -169,7 +184,8 @@ impl<T: Pod> Clone for Piece<T> {
 }
 
 /// A mirror's buffers, on the heap unless they were lent.
-#[derive(Clone, Debug)]
+#[cfg_attr(feature = "std", derive(Clone))]
+#[derive(Debug)]
 pub struct Heap {
     instances: Piece<Instance>,
     buckets: Piece<Bucket>,
@@ -177,14 +193,19 @@ pub struct Heap {
     dirty: Piece<u64>,
 }
 
-impl Default for Heap {
-    fn default() -> Heap {
-        Heap::new(Capacity::default())
-    }
-}
-
 impl Heap {
+    /// No buffers, and no room for any.
+    pub(crate) fn empty() -> Heap {
+        Heap {
+            instances: Piece::empty(),
+            buckets: Piece::empty(),
+            cells: Piece::empty(),
+            dirty: Piece::empty(),
+        }
+    }
+
     /// Zeroed buffers of the given capacity, on the heap.
+    #[cfg(feature = "std")]
     pub fn new(capacity: Capacity) -> Heap {
         let mut heap = Heap::from(&mut Source::Heap, capacity);
         heap.resize(capacity);
@@ -220,7 +241,9 @@ impl Heap {
     }
 }
 
+// Every change of the mirror asks for its buffers.
 impl Memory for Heap {
+    #[inline]
     fn parts(&self) -> Parts<'_> {
         let Heap {
             instances,
@@ -236,6 +259,7 @@ impl Memory for Heap {
         }
     }
 
+    #[inline]
     fn parts_mut(&mut self) -> PartsMut<'_> {
         let Heap {
             instances,
@@ -253,7 +277,8 @@ impl Memory for Heap {
 }
 
 /// What profile `residual` keeps beside a mirror, on the heap unless it was lent.
-#[derive(Clone, Debug)]
+#[cfg_attr(feature = "std", derive(Clone))]
+#[derive(Debug)]
 pub struct SliceHeap {
     slices: Piece<Slice>,
     patches: Piece<Patch>,
@@ -268,14 +293,9 @@ pub struct SliceHeap {
     scratch_of: [u32; 3],
 }
 
-impl Default for SliceHeap {
-    fn default() -> SliceHeap {
-        SliceHeap::new(Capacity::default())
-    }
-}
-
 impl SliceHeap {
     /// Room as a header asks for, on the heap: no patch has come, no slice is open.
+    #[cfg(feature = "std")]
     pub fn new(capacity: Capacity) -> SliceHeap {
         let mut heap = SliceHeap::from(&mut Source::Heap, capacity);
         heap.resize(capacity);

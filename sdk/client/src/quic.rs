@@ -45,6 +45,9 @@ const KEEP_ALIVE: Duration = Duration::from_secs(3);
 /// Time to connect. A server that is not there does not answer, so this is when that shows.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
 
+/// The application error code of a close over no error.
+const DONE: VarInt = VarInt::from_u32(0);
+
 /// Time to tell the server that the connection is closed.
 const CLOSE_TIMEOUT: Duration = Duration::from_secs(1);
 
@@ -250,7 +253,9 @@ impl std::error::Error for ConnectError {}
 pub enum Closed {
     /// The server ended the stream; all of it was received.
     Ended,
-    /// The server closed the connection (what it says).
+    /// The server closed the connection and blames nobody: it shuts down, say (what it says).
+    Done(String),
+    /// The server closed the connection over an error (what it says).
     ByServer(String),
     /// The network or the server is gone (why).
     Lost(String),
@@ -260,7 +265,9 @@ impl std::fmt::Display for Closed {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
             Closed::Ended => f.write_str("the server ended the stream"),
-            Closed::ByServer(text) => write!(f, "the server closed the connection: {text}"),
+            Closed::Done(text) | Closed::ByServer(text) => {
+                write!(f, "the server closed the connection: {text}")
+            }
             Closed::Lost(why) => write!(f, "the connection is lost ({why}): open a new one"),
         }
     }
@@ -515,7 +522,7 @@ impl Connection {
 impl Drop for Connection {
     fn drop(&mut self) {
         lock(&self.shared.received).dropped = true;
-        self.quic.close(VarInt::from_u32(0), b"");
+        self.quic.close(DONE, b"");
         self.shared.room.notify_one();
         if let Some(thread) = self.thread.take() {
             let _ = thread.join();
@@ -586,7 +593,7 @@ async fn run(
     let sending = tokio::spawn(send_queued(send, Arc::clone(&shared)));
     let closed = receive_all(receive, &shared).await;
     // First: who learns that nothing more comes finds the uplink closed, too.
-    quic.close(VarInt::from_u32(0), b"");
+    quic.close(DONE, b"");
     lock(&shared.received).closed = Some(closed);
     shared.came.notify_one();
     sending.abort();
@@ -620,7 +627,11 @@ async fn receive_all(mut stream: RecvStream, shared: &Shared) -> Closed {
             }
             Ok(None) => return Closed::Ended,
             Err(ReadError::ConnectionLost(ConnectionError::ApplicationClosed(close))) => {
-                return Closed::ByServer(printable(&close.reason));
+                let why = printable(&close.reason);
+                return match close.error_code {
+                    DONE => Closed::Done(why),
+                    _ => Closed::ByServer(why),
+                };
             }
             Err(ReadError::ConnectionLost(ConnectionError::TimedOut)) => {
                 return Closed::Lost(format!(

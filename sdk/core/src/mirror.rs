@@ -437,28 +437,32 @@ fn replace<T: bytemuck::Pod>(
     kind: u64,
     hash: &mut u64,
 ) {
-    let old = values[index as usize];
-    if bytemuck::bytes_of(&old) != bytemuck::bytes_of(&value) {
-        *hash = hash
-            .wrapping_sub(hash_of(&old, index, kind))
-            .wrapping_add(hash_of(&value, index, kind));
-        values[index as usize] = value;
-        dirty::mark(set, values.len(), index as usize);
+    let length = values.len();
+    let old = &mut values[index as usize];
+    let words = words_of(old).iter().zip(words_of(&value));
+    let mut changed = false;
+    for (at, (before, after)) in (0..).zip(words).filter(|(_, (a, b))| a != b) {
+        let change = u64::from(*after).wrapping_sub(u64::from(*before));
+        *hash = hash.wrapping_add(word_factor(kind, index, at).wrapping_mul(change));
+        changed = true;
+    }
+    if changed {
+        *old = value;
+        dirty::mark(set, length, index as usize);
     }
 }
 
 /// The part of one element in the mirror's hash: each 32-bit word times its own factor. So a
 /// change of one word costs one multiplication, and what is zero does not count.
 fn hash_of<T: bytemuck::Pod>(value: &T, index: u32, kind: u64) -> u64 {
-    let words: &[u32] = bytemuck::cast_slice(core::slice::from_ref(value));
     let parts = (0..)
-        .zip(words)
-        .map(|(at, &word)| word_hash(kind, index, at, word));
+        .zip(words_of(value))
+        .map(|(at, &word)| word_factor(kind, index, at).wrapping_mul(u64::from(word)));
     parts.fold(0, u64::wrapping_add)
 }
 
-fn word_hash(kind: u64, index: u32, at: u32, word: u32) -> u64 {
-    word_factor(kind, index, at).wrapping_mul(u64::from(word))
+fn words_of<T: bytemuck::Pod>(value: &T) -> &[u32] {
+    bytemuck::cast_slice(core::slice::from_ref(value))
 }
 
 fn word_factor(kind: u64, index: u32, at: u32) -> u64 {

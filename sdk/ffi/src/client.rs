@@ -1,18 +1,18 @@
 //! The client: memory, stream in, frames out.
 
+use crate::border::unless_it_panics;
 use crate::front::{Front, Shown};
 use crate::handoff::{Before, Handoff};
 use crate::result::psao_result::{self, *};
 use crate::types::*;
+use core::cell::UnsafeCell;
+use core::ffi::{c_char, c_void};
+use core::fmt::Write;
+use core::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
 use psao::core::mirror::{Buffer, Capacity};
 use psao::core::stream::{Frame, Header, PREAMBLE, Packet, kind};
 use psao::memory::{Limits, Line, Source};
 use psao::{Client, ClientError, State};
-use std::cell::UnsafeCell;
-use std::ffi::{c_char, c_void};
-use std::fmt::Write;
-use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
 
 /// Largest body of a stream's first packet.
 const FIRST_BODY_BYTES: u32 = 4096;
@@ -66,7 +66,7 @@ impl Text {
         length: 0,
     };
 
-    fn of(args: std::fmt::Arguments<'_>) -> Text {
+    fn of(args: core::fmt::Arguments<'_>) -> Text {
         let mut text = Text::EMPTY;
         // Only cuts off.
         let _ = text.write_fmt(args);
@@ -79,7 +79,7 @@ impl Text {
 }
 
 impl Write for Text {
-    fn write_str(&mut self, text: &str) -> std::fmt::Result {
+    fn write_str(&mut self, text: &str) -> core::fmt::Result {
         let mut end = text.len().min(self.bytes.len() - self.length);
         while !text.is_char_boundary(end) {
             end -= 1;
@@ -112,9 +112,9 @@ const CLIENT_LINES: u64 = size_of::<psao_client>().div_ceil(size_of::<Line>()) a
 
 /// Runs a function that must not unwind into C.
 pub(crate) fn guarded(body: impl FnOnce() -> Result<psao_result, psao_result>) -> psao_result {
-    match catch_unwind(AssertUnwindSafe(body)) {
-        Ok(Ok(result) | Err(result)) => result,
-        Err(_) => PSAO_ERROR_INTERNAL,
+    match unless_it_panics(body) {
+        Some(Ok(result) | Err(result)) => result,
+        None => PSAO_ERROR_INTERNAL,
     }
 }
 
@@ -133,9 +133,9 @@ pub(crate) unsafe fn with(
     if client.poisoned.load(Ordering::Relaxed) {
         return PSAO_ERROR_INTERNAL;
     }
-    match catch_unwind(AssertUnwindSafe(|| body(client))) {
-        Ok(Ok(result) | Err(result)) => result,
-        Err(_) => {
+    match unless_it_panics(|| body(client)) {
+        Some(Ok(result) | Err(result)) => result,
+        None => {
             client.poisoned.store(true, Ordering::Relaxed);
             PSAO_ERROR_INTERNAL
         }
@@ -160,7 +160,7 @@ pub(crate) unsafe fn slice_of<'a, T>(
         return Err(PSAO_ERROR_VALUE);
     }
     // SAFETY: not null, aligned, of a possible size, and the caller's word for the rest.
-    Ok(unsafe { std::slice::from_raw_parts(items, count) })
+    Ok(unsafe { core::slice::from_raw_parts(items, count) })
 }
 
 /// Writes an output; the last thing that a function does.
@@ -184,7 +184,7 @@ impl Default for psao_config {
             scene_hash: 0,
             stale_after_ns: 0,
             log: None,
-            log_user_data: std::ptr::null_mut(),
+            log_user_data: core::ptr::null_mut(),
             instance_count: 0,
             bucket_count: 0,
             cell_count: 0,
@@ -349,7 +349,7 @@ pub unsafe extern "C" fn psao_client_init(
         let pieces = unsafe {
             let first = block.add(head);
             first.write_bytes(0, lines - head);
-            std::slice::from_raw_parts_mut(first, lines - head)
+            core::slice::from_raw_parts_mut(first, lines - head)
         };
         let (client, front) = config.build(&mut Source::Lent(pieces));
         let client = psao_client {
@@ -387,7 +387,7 @@ pub unsafe extern "C" fn psao_client_init(
 }
 
 const _: () = assert!(align_of::<psao_client>() <= align_of::<Line>());
-const _: () = assert!(!std::mem::needs_drop::<Frame>());
+const _: () = assert!(!core::mem::needs_drop::<Frame>());
 
 impl psao_client {
     /// The pusher's part.
@@ -560,7 +560,7 @@ pub unsafe extern "C" fn psao_client_restart(client: *mut psao_client) -> psao_r
         with(client, |client| {
             let pusher = client.pusher();
             if pusher.client.state() == State::Failed {
-                let error = std::mem::replace(&mut pusher.error, Text::EMPTY);
+                let error = core::mem::replace(&mut pusher.error, Text::EMPTY);
                 pusher.log(psao_log_level::PSAO_LOG_ERROR, &error);
                 pusher.error = error;
             }
@@ -848,7 +848,7 @@ pub unsafe extern "C" fn psao_client_dirty_ranges(
                 return Err(PSAO_ERROR_NULL);
             }
             let count = client.with_taken(|_, shown| {
-                let list = |at: usize, run: std::ops::Range<u32>| {
+                let list = |at: usize, run: core::ops::Range<u32>| {
                     let range = psao_range {
                         first_index: run.start,
                         count: run.end - run.start,
@@ -953,7 +953,7 @@ mod tests {
             ..psao_config::default()
         };
         let mut memory: Vec<Line> = vec![bytemuck::Zeroable::zeroed(); config.lines().unwrap()];
-        let mut client = std::ptr::null_mut();
+        let mut client = core::ptr::null_mut();
         let bytes = size_of_val(&memory[..]);
         // SAFETY: all that is passed lives until the end, and the client is used from here alone.
         unsafe {
@@ -986,7 +986,7 @@ mod tests {
             // A new client in the same memory knows nothing of it.
             let init = psao_client_init(&config, memory.as_mut_ptr().cast(), bytes, &mut client);
             assert_eq!(init, PSAO_OK);
-            let push = psao_client_push(client, std::ptr::null(), 0, 0, &mut used);
+            let push = psao_client_push(client, core::ptr::null(), 0, 0, &mut used);
             assert_eq!(push, PSAO_NEED_MORE);
         }
     }

@@ -1,10 +1,10 @@
 //! What the taker sees of a frame: its own copy of the mirror, or the mirror itself.
 
+use core::ops::Range;
 use psao::core::mirror::{Buffer, Capacity, Memory, Mirror, Parts, PartsMut};
 use psao::core::stream::Frame;
 use psao::core::{Kernel, Lookup, dirty};
 use psao::memory::{Heap, Source};
-use std::ops::Range;
 
 /// The newest frame that was handed over.
 pub struct Front {

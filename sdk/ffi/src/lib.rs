@@ -7,15 +7,27 @@
 //! camera, transforms, poses ─► psao_uplink_… ─► bytes
 //! ```
 #![allow(non_camel_case_types)]
+#![cfg_attr(not(feature = "std"), no_std)]
+
+#[cfg(all(feature = "std", panic = "abort"))]
+compile_error!(
+    "panics cannot be stopped with panic = \"abort\" unless the feature std is left out"
+);
+#[cfg(all(not(feature = "std"), panic = "unwind"))]
+compile_error!("without the feature std panics cannot unwind: build with --profile libpsao");
 
 // Its constants are the first in the header.
 mod version;
 
+mod border;
 mod client;
 #[cfg(feature = "quic")]
 mod connection;
 mod front;
 mod handoff;
+/// cbindgen:ignore
+#[cfg(feature = "provoke")]
+mod provoke;
 mod result;
 mod sync;
 mod types;

@@ -1,8 +1,8 @@
 //! What every function answers.
 
+use core::ffi::{CStr, c_char};
 use psao::ClientError;
 use psao::core::stream::{Refusal, StreamError};
-use std::ffi::{CStr, c_char};
 
 /// What a function answers: 0 or more is a success, less is a failure, and what the function
 /// writes is then untouched. Values are never reused; new ones may come.

@@ -1,14 +1,14 @@
 //! The atomics of [`crate::handoff`], which its test replaces by loom's.
 
-pub use std::sync::atomic::{AtomicU32, Ordering};
+pub use core::sync::atomic::{AtomicU32, Ordering};
 
 /// `std`'s, with loom's interface.
-pub struct UnsafeCell<T>(std::cell::UnsafeCell<T>);
+pub struct UnsafeCell<T>(core::cell::UnsafeCell<T>);
 
 impl<T> UnsafeCell<T> {
     /// Around a value.
     pub fn new(value: T) -> UnsafeCell<T> {
-        UnsafeCell(std::cell::UnsafeCell::new(value))
+        UnsafeCell(core::cell::UnsafeCell::new(value))
     }
 
     /// The value, to read.

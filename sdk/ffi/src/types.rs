@@ -1,10 +1,10 @@
 //! The plain structs that cross the border, and how they do.
 
 use crate::result::psao_result::{self, *};
+use core::ffi::{c_char, c_void};
 use psao::core::mirror::Capacity;
 use psao::core::{Bucket, Cell, Instance};
 use psao::memory::Limits;
-use std::ffi::{c_char, c_void};
 
 /// How important a message is.
 #[repr(u32)]
@@ -346,7 +346,7 @@ pub(crate) unsafe fn read_struct<T: Sized32>(from: *const T) -> Result<T, psao_r
     }
     // SAFETY: all-zero bytes are a `T`. The first `known` bytes are within both.
     Ok(unsafe {
-        let mut value: T = std::mem::zeroed();
+        let mut value: T = core::mem::zeroed();
         from.copy_to_nonoverlapping((&raw mut value).cast(), known);
         value
     })

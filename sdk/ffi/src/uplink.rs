@@ -35,7 +35,7 @@ unsafe fn message(
     // SAFETY: not null, and the caller's word for the rest.
     unsafe {
         let sequence = (*uplink).next_sequence;
-        let out = std::slice::from_raw_parts_mut(out, room);
+        let out = core::slice::from_raw_parts_mut(out, room);
         let written = match write_packet(out, kind, 0, sequence, body) {
             Err(StreamError::Length) => return Err(PSAO_ERROR_OUTPUT_SIZE),
             written => written?,

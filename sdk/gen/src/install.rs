@@ -3,8 +3,8 @@
 use std::path::Path;
 use std::process::Command;
 
-/// What a program that links libpsao.a has to link besides, on Linux.
-const SYSTEM_LIBRARIES: &str = "-lpthread -ldl -lm -lgcc_s -lc";
+/// What a program that links libpsao.a has to link besides.
+const SYSTEM_LIBRARIES: &str = "-lc";
 
 /// Builds the library and puts it, its header, `psao.pc` and a CMake package under `prefix`.
 ///
@@ -13,8 +13,15 @@ const SYSTEM_LIBRARIES: &str = "-lpthread -ldl -lm -lgcc_s -lc";
 pub fn install(root: &Path, prefix: &Path) -> Result<(), String> {
     let build = Command::new(std::env::var("CARGO").unwrap_or("cargo".into()))
         .current_dir(root)
-        .args(["build", "--locked", "--profile", "sdk", "-p", "psao-ffi"])
-        .args(["--features", "thin"])
+        .args([
+            "build",
+            "--locked",
+            "--profile",
+            "libpsao",
+            "-p",
+            "psao-ffi",
+        ])
+        .args(["--no-default-features", "--features", "thin"])
         .args(["--message-format", "json"])
         .output()
         .map_err(|error| format!("cargo: {error}"))?;
