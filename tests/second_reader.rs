@@ -824,18 +824,6 @@ impl Patch<'_> {
     }
 
     /// Plain bits, as many as one likes: those above the lowest 16 first.
-    /// 15.11
-    fn symbol(&mut self, row: &[u64]) -> usize {
-        let p = self.range >> 16;
-        let symbol = row.iter().take_while(|n| self.code >= p * **n).count();
-        let start = if symbol == 0 { 0 } else { p * row[symbol - 1] };
-        let end = row.get(symbol).map_or(self.range, |n| p * n);
-        self.code = self.code.wrapping_sub(start);
-        self.range = end - start;
-        self.refill();
-        symbol
-    }
-
     fn plain(&mut self, bits: u32) -> u32 {
         if bits > 16 {
             let above = self.coder.plain(bits - 16);

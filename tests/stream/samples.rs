@@ -448,7 +448,7 @@ impl Coded {
                 slices.close(&mut self.mirror, index).unwrap();
                 return (index, operation, 0, Vec::new());
             }
-            _ => slices.prepare(&self.mirror, index, None).unwrap(),
+            _ => {}
         }
         let slice = slices.get(index).unwrap();
         let shown = match operation {

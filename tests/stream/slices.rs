@@ -11,7 +11,7 @@ use psao::core::cell::Cell;
 use psao::core::grid::Instance;
 use psao::core::mirror::Capacity;
 use psao::core::point::{Point, encode_normal};
-use psao::core::residual::{Neighbours, SliceState, encode_slice};
+use psao::core::residual::{Neighbours, Quantiser, SliceState, encode_slice};
 use psao::core::slices::{FIRST, Operation, apply_instances, apply_patches, apply_slices};
 use psao::core::stream::{Header, MAX_BODY_BYTES, Packet, Profile, StreamError, flag, kind};
 use psao::core::topology::PatchPoint;
@@ -117,7 +117,22 @@ fn still(points: u32, first: bool) -> Vec<u8> {
     let neighbours = vec![Neighbours::default(); count];
     let target = vec![255; count];
     let mut data = vec![0; 64];
-    let length = encode_slice(&neighbours, FIRST, &mut state, &target, first, &mut data);
+    let quantiser = Quantiser {
+        step: if first {
+            FIRST.step
+        } else {
+            slices_header().step
+        },
+        dead_zone: 0,
+    };
+    let length = encode_slice(
+        &neighbours,
+        quantiser,
+        &mut state,
+        &target,
+        first,
+        &mut data,
+    );
     data.truncate(length.unwrap());
     data
 }
@@ -271,8 +286,8 @@ fn items_whose_bytes_do_not_fit_are_refused() {
         assert_eq!(error, Some(StreamError::Length.into()), "{short} bytes");
     }
     refused(&[&good, &[0x80]], "15.2: length");
-    // The data itself ends too early, or too late.
-    for data in [vec![], [&data[..], &[0]].concat(), vec![0xff; 9]] {
+    // The data itself ends too early, or too late. (None at all say that all points move, by nothing.)
+    for data in [vec![0], [&data[..], &[0]].concat(), vec![0xff; 9]] {
         let list = items(&[(0, Operation::Open([0, 0, 0], 3), count, data)]);
         refused(&[&list], "15.9: end of the data");
     }
