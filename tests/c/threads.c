@@ -3,7 +3,9 @@
  * together: each client has a thread that pushes and a thread that takes: every frame taken is one
  * that the server sent, whole, and they come in order.
  * apart: each client has a thread that does both: nothing is shared between clients. (So the
- * thread sanitizer can judge it, which doesn't know of the library's own atomics.) */
+ * thread sanitizer can judge it also where the library was not compiled for it: tests/tsan.)
+ * wrong: two threads restart the first client, which is against the rules: tests/tsan expects
+ * that the sanitizer says so. */
 #include "common.h"
 #include <pthread.h>
 #include <stdatomic.h>
@@ -131,6 +133,24 @@ static void play_together(pair *pairs, int count) {
     }
 }
 
+static void *restart_often(void *argument) {
+    psao_client *client = (psao_client *)argument;
+    for (int i = 0; i < 1000; i++)
+        GIVES(PSAO_OK, psao_client_restart(client));
+    return NULL;
+}
+
+static void push_twice(const pair *pair) {
+    psao_config config = config_of(pair->stream);
+    owned made = make(&config);
+    pthread_t threads[2];
+    for (int i = 0; i < 2; i++)
+        CHECK(pthread_create(&threads[i], NULL, restart_often, made.client) == 0);
+    for (int i = 0; i < 2; i++)
+        CHECK(pthread_join(threads[i], NULL) == 0);
+    free(made.block);
+}
+
 int main(int count, char **words) {
     static pair pairs[4];
     CHECK(count > 2 && count <= 6);
@@ -142,6 +162,8 @@ int main(int count, char **words) {
     }
     if (strcmp(words[1], "together") == 0) {
         play_together(pairs, clients);
+    } else if (strcmp(words[1], "wrong") == 0) {
+        push_twice(&pairs[0]);
     } else {
         for (int i = 0; i < clients; i++)
             CHECK(pthread_create(&pairs[i].pusher, NULL, play_apart, &pairs[i]) == 0);

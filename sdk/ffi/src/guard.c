@@ -54,3 +54,7 @@ void psao_guard_leave(void) {
         abort();
     _longjmp(guard->place, 1);
 }
+
+/* Parts of Rust's core library name it in tables for unwinding, which nothing here does. Weak: in a
+ * program with another Rust library it is that one's. */
+__attribute__((weak)) void rust_eh_personality(void) { abort(); }

@@ -3,25 +3,42 @@
 use std::path::Path;
 use std::process::Command;
 
-/// What a program that links libpsao.a has to link besides.
-const SYSTEM_LIBRARIES: &str = "-lc";
+/// How the library is built, and what follows from that for a program that uses it.
+struct Variant {
+    cargo: &'static str,
+    /// What the header wants defined, as for CMake and for a compiler.
+    define: [&'static str; 2],
+    /// What a program that links libpsao.a has to link besides.
+    system_libraries: &'static str,
+}
 
-/// Builds the library and puts it, its header, `psao.pc` and a CMake package under `prefix`.
+const SMALL: Variant = Variant {
+    cargo: "--profile libpsao --no-default-features --features thin",
+    define: ["", ""],
+    system_libraries: "-lc",
+};
+
+const QUIC: Variant = Variant {
+    cargo: "--profile sdk --features thin,quic",
+    define: ["PSAO_QUIC", " -DPSAO_QUIC"],
+    system_libraries: "-lpthread -ldl -lm -lgcc_s -lc",
+};
+
+/// Builds the library and puts it, its header, `psao.pc` and a CMake package under `prefix`. With
+/// `quic` it can connect by itself.
 ///
 /// # Errors
 /// It does not build, or a file cannot be written.
-pub fn install(root: &Path, prefix: &Path) -> Result<(), String> {
+pub fn install(root: &Path, prefix: &Path, quic: bool) -> Result<(), String> {
+    let Variant {
+        cargo,
+        define: [define, cflag],
+        system_libraries,
+    } = if quic { QUIC } else { SMALL };
     let build = Command::new(std::env::var("CARGO").unwrap_or("cargo".into()))
         .current_dir(root)
-        .args([
-            "build",
-            "--locked",
-            "--profile",
-            "libpsao",
-            "-p",
-            "psao-ffi",
-        ])
-        .args(["--no-default-features", "--features", "thin"])
+        .args(["build", "--locked", "-p", "psao-ffi"])
+        .args(cargo.split(' '))
         .args(["--message-format", "json"])
         .output()
         .map_err(|error| format!("cargo: {error}"))?;
@@ -68,9 +85,9 @@ pub fn install(root: &Path, prefix: &Path) -> Result<(), String> {
              Name: psao\n\
              Description: Client of PSAO: streamed, ray-traced ambient occlusion\n\
              Version: {version}\n\
-             Cflags: -I${{prefix}}/include\n\
+             Cflags: -I${{prefix}}/include{cflag}\n\
              Libs: -L${{prefix}}/lib -lpsao\n\
-             Libs.private: {SYSTEM_LIBRARIES}\n"
+             Libs.private: {system_libraries}\n"
         )
         .as_bytes(),
     )?;
@@ -84,11 +101,13 @@ pub fn install(root: &Path, prefix: &Path) -> Result<(), String> {
              \x20 set_target_properties(psao::psao PROPERTIES\n\
              \x20   IMPORTED_LOCATION \"${{psao_prefix}}/lib/{soname}\"\n\
              \x20   IMPORTED_SONAME \"{soname}\"\n\
+             \x20   INTERFACE_COMPILE_DEFINITIONS \"{define}\"\n\
              \x20   INTERFACE_INCLUDE_DIRECTORIES \"${{psao_prefix}}/include\")\n\
              \x20 add_library(psao::static STATIC IMPORTED)\n\
              \x20 set_target_properties(psao::static PROPERTIES\n\
              \x20   IMPORTED_LOCATION \"${{psao_prefix}}/lib/libpsao.a\"\n\
-             \x20   INTERFACE_LINK_LIBRARIES \"{SYSTEM_LIBRARIES}\"\n\
+             \x20   INTERFACE_LINK_LIBRARIES \"{system_libraries}\"\n\
+             \x20   INTERFACE_COMPILE_DEFINITIONS \"{define}\"\n\
              \x20   INTERFACE_INCLUDE_DIRECTORIES \"${{psao_prefix}}/include\")\n\
              endif()\n"
         )

@@ -27,6 +27,9 @@ enum Command {
         /// Where to: lib/, include/ in it are made
         #[arg(long)]
         prefix: PathBuf,
+        /// Build it with its own transport: larger, with a thread and memory from the heap
+        #[arg(long)]
+        quic: bool,
     },
 }
 
@@ -34,7 +37,7 @@ fn main() -> ExitCode {
     let args = Args::parse();
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
     let done = match args.command {
-        Some(Command::Install { prefix }) => install::install(&root, &prefix),
+        Some(Command::Install { prefix, quic }) => install::install(&root, &prefix, quic),
         None => generated(&root).and_then(|files| settle(&root, &files, args.check)),
     };
     match done {
