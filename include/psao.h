@@ -568,6 +568,23 @@ psao_result psao_client_dirty_ranges(const struct psao_client *client,
                                      uint32_t capacity_count,
                                      uint32_t *out_count);
 
+/* Copies buckets with a tag in each entry, which psao_planar_fast of the shaders wants: above the
+ * cell's index (22 bits), a few bits of the cell's key, so that no cell is read in vain. Copy the
+ * dirty ranges of PSAO_BUFFER_BUCKETS so, and upload the copies; a bucket is dirty, too, where
+ * just a tag changed. psao_planar and psao_paper work with tags and without.
+ *
+ * out_buckets: count of them.
+ *
+ * PSAO_ERROR_VALUE: the range is not within the frame's buckets. PSAO_ERROR_CAPACITY: the frame
+ * has more than 4194304 cells, so that their indices leave no room: upload the buckets as they
+ * are, and call psao_planar. PSAO_ERROR_ORDER: no frame is taken.
+ *
+ * Threads: taker. Time: grows with count. No alloc, lock or log. Since ABI 1. */
+psao_result psao_client_tag_buckets(const struct psao_client *client,
+                                    uint32_t first_index,
+                                    uint32_t count,
+                                    struct psao_bucket *out_buckets);
+
 /* Looks ambient occlusion up at points of one instance, on the CPU: what the shader does for
  * each fragment.
  *
@@ -594,6 +611,16 @@ psao_result psao_client_lookup(const struct psao_client *client,
  *
  * Threads: taker. Time: grows with what changed. No alloc, lock or log. Since ABI 1. */
 psao_result psao_client_release(struct psao_client *client);
+
+/* Makes everything dirty: call it when your buffers were lost with their device, or made anew.
+ * The next psao_client_take then gives the newest frame, even if you had it before, and its
+ * ranges cover the whole buffers.
+ *
+ * PSAO_ERROR_ORDER: a frame is taken; release it first.
+ *
+ * Threads: taker. Time: constant; the next psao_client_take's grows with the capacity. No alloc,
+ * lock or log. Since ABI 1. */
+psao_result psao_client_mark_all_dirty(struct psao_client *client);
 
 #if defined(PSAO_QUIC)
 /* Connects to a server and sends the hello: what psao_uplink_hello would write, with config and

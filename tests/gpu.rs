@@ -419,7 +419,7 @@ fn fast_takes_fewer_milliseconds_than_exact() {
             shot.name,
             exact / fast
         );
-        assert!(fast < 0.8 * exact, "fast takes {fast} ms, exact {exact} ms");
+        assert!(fast < 0.5 * exact, "fast takes {fast} ms, exact {exact} ms");
     }
 }
 
@@ -633,15 +633,12 @@ fn only_what_changed_is_uploaded_and_then_the_gpu_has_the_mirror() {
     );
 }
 
-/// The GPU's buffers are the mirror's, with a tag in each entry of a bucket.
+/// The GPU's buffers are the mirror's, with tags in the buckets.
 fn assert_holds<M: psao_core::mirror::Memory>(buffers: &Buffers, mirror: &Mirror<M>, when: &str) {
-    let mut tagged = mirror.buckets().to_vec();
-    for entry in tagged.iter_mut().flat_map(|bucket| &mut bucket.entries) {
-        if *entry != 0 {
-            let key = mirror.cells()[*entry as usize].key;
-            *entry |= (key.wrapping_mul(0x9e37_79b1) >> 22).max(1) << 22;
-        }
-    }
+    let tagged = mirror.buckets().iter();
+    let tagged: Vec<Bucket> = tagged
+        .map(|bucket| psao_core::tags::tagged(bucket, mirror.cells()))
+        .collect();
     let parts: [(Buffer, &[u8]); 3] = [
         (Buffer::Instances, bytemuck::cast_slice(mirror.instances())),
         (Buffer::Buckets, bytemuck::cast_slice(&tagged)),
@@ -676,7 +673,6 @@ fn a_cell_that_gets_another_key_in_the_same_entry_gets_another_tag() {
     }));
     let mut buffers = Buffers::new(&gpu.device, capacity).unwrap();
     let entries = [3, 5, 0, 0, 0, 0, 0, 0];
-    mirror.set_bucket(2, Bucket { entries }).unwrap();
     for (cell, keys) in [(3, [7, 7, 100]), (5, [9, 2000, 9])] {
         let with_key = |key| Cell {
             key,
@@ -684,6 +680,7 @@ fn a_cell_that_gets_another_key_in_the_same_entry_gets_another_tag() {
         };
         for key in keys {
             mirror.set_cell(cell, with_key(key)).unwrap();
+            mirror.set_bucket(2, Bucket { entries }).unwrap();
             let mut encoder = gpu.encoder();
             buffers.upload(&mut encoder, &mirror);
             gpu.submit(encoder);
@@ -691,6 +688,19 @@ fn a_cell_that_gets_another_key_in_the_same_entry_gets_another_tag() {
             assert_holds(&buffers, &mirror, &format!("cell {cell} with key {key}"));
         }
     }
+}
+
+#[test]
+fn all_of_it_is_uploaded_again_into_buffers_that_were_made_anew() {
+    let gpu = &*GPU;
+    let mut stream = Stream::new(Scene::atrium(), 16.0, 16);
+    let mut client = stream.client();
+    stream.next(&mut client, 0.0);
+    client.clear_dirty();
+    client.mark_all_dirty();
+    let buffers = gpu.buffers(&client);
+    client.clear_dirty();
+    assert_holds(&buffers, client.mirror(), "after a lost device");
 }
 
 fn mirror_bytes<M: psao_core::mirror::Memory>(mirror: &Mirror<M>) -> u64 {

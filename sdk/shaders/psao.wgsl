@@ -102,11 +102,8 @@ fn psao_weigh(grid: PsaoGrid, cell: vec3<u32>, weight_y: u32, weight_z: u32) -> 
         + cell.z * (grid.dims.x * grid.dims.y) * weight_z;
 }
 
-// The index of the cell at a grid coordinate, 0 if there is none: hash (Eq. 1), then search its
-// bucket for the key.
-fn psao_find(grid: PsaoGrid, cell: vec3<u32>) -> u32 {
-    let key = psao_weigh(grid, cell, 1u, 1u);
-    let bucket = grid.bucket_first + psao_weigh(grid, cell, 17u, 31u) % grid.bucket_count;
+// The index of the cell with a key that a bucket names, 0 if there is none.
+fn psao_search(bucket: u32, key: u32) -> u32 {
     for (var i = 0u; i < 8u; i += 1u) {
         let entry = psao_load_bucket(bucket * 2u + (i >> 2u))[i & 3u] & PSAO_ENTRY_CELL;
         if entry == 0u {
@@ -117,6 +114,13 @@ fn psao_find(grid: PsaoGrid, cell: vec3<u32>) -> u32 {
         }
     }
     return 0u;
+}
+
+// The index of the cell at a grid coordinate, 0 if there is none: hash (Eq. 1), then search its
+// bucket for the key.
+fn psao_find(grid: PsaoGrid, cell: vec3<u32>) -> u32 {
+    let bucket = grid.bucket_first + psao_weigh(grid, cell, 17u, 31u) % grid.bucket_count;
+    return psao_search(bucket, psao_weigh(grid, cell, 1u, 1u));
 }
 
 // A point's place in its cell, in cells: the middle of its 1/32 step.
@@ -237,10 +241,11 @@ fn psao_paper(instance: u32, position: vec3<f32>, normal: vec3<f32>) -> f32 {
 // ---- The same as psao_planar, in fewer steps, for buckets with tags. Without them it gives the
 // same picture, but not sooner. ----
 
-// The tag of a key in its bucket's entry; never 0. Whoever uploads buckets may put it there: it
-// tells a cell that is not there without a look at the cells that are.
+// The tag of a key where a bucket's entry has it, above the cell's index; never 0. Whoever uploads
+// buckets may put it there: it tells a cell that is not there without a look at the cells that are.
+// No two entries of a bucket have the same tag: such a bucket is left without any.
 fn psao_tag(key: u32) -> u32 {
-    return max((key * 0x9e3779b1u) >> 22u, 1u);
+    return max((key * 0x9e3779b1u) & ~PSAO_ENTRY_CELL, PSAO_ENTRY_CELL + 1u);
 }
 
 // hash % count, for a count below 2^23; inverse is 1 / count. Integer division is slow on GPUs.
@@ -253,143 +258,279 @@ fn psao_modulo(hash: u32, count: u32, inverse: f32) -> u32 {
     return select(raised, raised - count, raised >= count);
 }
 
-// A blend that is being made: the sum of the weights, and of the weighted openness in 1/255.
-// `place` is the fragment's in the cell, half a step less; `side` the cell's part. What is no point
-// adds nothing. Signed integers become floats in one step everywhere, unsigned ones do not.
-fn psao_add(
-    sums: ptr<function, vec2<f32>>,
-    inverse_radius2: f32,
-    normal: vec3<f32>,
-    place: vec3<f32>,
-    side: f32,
-    point: u32,
-) {
-    let steps = vec3<i32>(vec3<u32>(point) & vec3<u32>(0x1f0000u, 0x3e00000u, 0x7c000000u));
-    let scale = vec3<f32>(0.03125 / 65536.0, 0.03125 / 2097152.0, 0.03125 / 67108864.0);
-    let d = vec3<f32>(steps) * scale - place;
-    let codes = vec2<i32>(vec2<u32>(point >> 8u, point >> 12u) & vec2<u32>(15u));
-    let uv = vec2<f32>(min(codes, vec2<i32>(14))) - 7.0;
-    let z = 7.0 - abs(uv.x) - abs(uv.y);
-    let fold = max(-z, 0.0);
-    // The point's normal, of any length: what is squared below is divided by its square.
-    let m = vec3<f32>(uv - select(vec2<f32>(fold), vec2<f32>(-fold), uv < vec2<f32>(0.0)), z);
-    let inverse = 1.0 / dot(m, m);
-    let agree = max(dot(m, normal), 0.0);
-    let agree2 = max(agree * agree * inverse, PSAO_T_N * PSAO_T_N);
-    let along = dot(normal, d);
-    let point_along = dot(m, d);
-    let h2 = max(along * along, point_along * point_along * inverse);
-    let apart = PSAO_CORE + (dot(d, d) + PSAO_FLATNESS * h2) * inverse_radius2;
-    let openness = f32(i32(point & 255u));
-    let seen = min(openness * (1.0 / (255.0 * PSAO_SEEN)), 1.0) + PSAO_UNSEEN;
-    let agree4 = agree2 * agree2;
-    let weight = side * seen * agree4 * agree4 / (apart * apart);
-    *sums += select(0.0, weight, point >= 0x80000000u) * vec2<f32>(1.0, openness);
+// Which bit is the lowest: the exponent of that bit as a float. GLSL ES 3.00 cannot say.
+fn psao_lowest(bits: u32) -> u32 {
+    return (bitcast<u32>(f32(i32(bits & (0u - bits)))) >> 23u) - 127u;
+}
+
+// A corner of a block, of 8: bits x, y, z.
+fn psao_corner(corner: u32) -> vec3<u32> {
+    return vec3<u32>(corner, corner >> 1u, corner >> 2u) & vec3<u32>(1u);
+}
+
+// As psao_grid, with a load less: only the direction of a normal counts.
+fn psao_grid_fast(instance: u32) -> PsaoGrid {
+    var grid = psao_grid(instance);
+    grid.normal_scale = grid.cells_per_unit.x / grid.cells_per_unit;
+    return grid;
+}
+
+// What keys and hashes of a block's cells are made of.
+struct PsaoTable {
+    // Of its lower cell.
+    key: u32,
+    hash: u32,
+    // What a step along y and z adds to a key.
+    row: u32,
+    layer: u32,
+    bucket_first: u32,
+    bucket_count: u32,
+    inverse_count: f32,
+}
+
+fn psao_table(grid: PsaoGrid, base: vec3<u32>) -> PsaoTable {
+    let row = grid.dims.x;
+    let layer = grid.dims.x * grid.dims.y;
+    return PsaoTable(
+        base.x + base.y * row + base.z * layer,
+        base.x + base.y * row * 17u + base.z * layer * 31u,
+        row,
+        layer,
+        grid.bucket_first,
+        grid.bucket_count,
+        1.0 / f32(grid.bucket_count),
+    );
+}
+
+fn psao_key(table: PsaoTable, offset: vec3<u32>) -> u32 {
+    return table.key + offset.x + select(0u, table.row, offset.y != 0u)
+        + select(0u, table.layer, offset.z != 0u);
+}
+
+fn psao_bucket(table: PsaoTable, offset: vec3<u32>) -> u32 {
+    let hash = table.hash + offset.x + select(0u, table.row * 17u, offset.y != 0u)
+        + select(0u, table.layer * 31u, offset.z != 0u);
+    return table.bucket_first + psao_modulo(hash, table.bucket_count, table.inverse_count);
 }
 
 // What one corner of a block may be.
 struct PsaoCandidate {
     // The cell that it is if it is there; 0 if it is not there for sure.
     cell: u32,
-    // There are several such cells: they have the same tag, or none.
-    unsure: bool,
+    // 1 where its bucket has to be searched.
+    unsure: u32,
 }
 
-// The one among four entries of a bucket that a tag allows.
-fn psao_pick(entries: vec4<u32>, tag: u32) -> PsaoCandidate {
-    let tags = entries >> vec4<u32>(22u);
-    let may = (tags == vec4<u32>(tag)) | (tags == vec4<u32>(0u));
-    // Not select: GLSL ES has none for integer vectors.
-    let cells = entries & vec4<u32>(PSAO_ENTRY_CELL) & (vec4<u32>(0u) - vec4<u32>(may));
-    // Their sum is one of them if the others are 0.
-    let sum = cells.x + cells.y + cells.z + cells.w;
-    return PsaoCandidate(sum, sum != max(max(cells.x, cells.y), max(cells.z, cells.w)));
+// What is left of the smallest entry with the tag looked for taken off: the cell, if below 2^22.
+fn psao_pick(entries: vec4<u32>, tag: u32) -> u32 {
+    let rest = entries ^ vec4<u32>(tag);
+    return min(min(rest.x, rest.y), min(rest.z, rest.w));
 }
 
-fn psao_candidate(grid: PsaoGrid, inverse_count: f32, cell: vec3<u32>) -> PsaoCandidate {
-    if any(cell >= grid.dims) {
-        return PsaoCandidate(0u, false);
+fn psao_candidate(there: bool, key: u32, bucket: u32) -> PsaoCandidate {
+    if !there {
+        return PsaoCandidate(0u, 0u);
     }
-    let tag = psao_tag(psao_weigh(grid, cell, 1u, 1u));
-    let hash = psao_weigh(grid, cell, 17u, 31u);
-    let bucket = grid.bucket_first + psao_modulo(hash, grid.bucket_count, inverse_count);
     let entries = psao_load_bucket(bucket * 2u);
-    let first = psao_pick(entries, tag);
-    if entries.w == 0u {
-        return first;
-    }
-    let other = psao_pick(psao_load_bucket(bucket * 2u + 1u), tag);
-    let both = first.cell != 0u && other.cell != 0u;
-    return PsaoCandidate(first.cell + other.cell, first.unsure || other.unsure || both);
+    let found = psao_pick(entries, psao_tag(key));
+    let here = found <= PSAO_ENTRY_CELL;
+    // One bucket of a hundred has a second half, one of some hundred no tags.
+    let unsure = (!here && entries.w != 0u) || entries.x - 1u < PSAO_ENTRY_CELL;
+    return PsaoCandidate(select(0u, found, here), select(0u, 1u, unsure));
+}
+
+// Two cells side by side along x, at a row of a block: its y and z.
+struct PsaoPair {
+    cells: vec2<u32>,
+    // Bits.
+    unsure: u32,
+}
+
+fn psao_pair(table: PsaoTable, there: vec2<bool>, row: vec2<u32>) -> PsaoPair {
+    let offset = vec3<u32>(0u, row);
+    let first = psao_bucket(table, offset);
+    // Their buckets are neighbours, too.
+    let last = first + 1u == table.bucket_first + table.bucket_count;
+    let next = select(first + 1u, table.bucket_first, last);
+    let key = psao_key(table, offset);
+    let a = psao_candidate(there.x, key, first);
+    let b = psao_candidate(there.y, key + 1u, next);
+    return PsaoPair(vec2<u32>(a.cell, b.cell), a.unsure | (b.unsure << 1u));
+}
+
+// The cells of a block.
+struct PsaoBlock {
+    // Of the corners 0 to 3 and 4 to 7; 0 where there is none for sure.
+    lower: vec4<u32>,
+    upper: vec4<u32>,
+    // Bits: the corners whose bucket has to be searched.
+    unsure: u32,
+}
+
+fn psao_block(grid: PsaoGrid, table: PsaoTable, base: vec3<u32>, live: bool) -> PsaoBlock {
+    let low = (base < grid.dims) & vec3<bool>(live);
+    let high = (base + 1u < grid.dims) & vec3<bool>(live);
+    let x = vec2<bool>(low.x, high.x);
+    let a = psao_pair(table, x & vec2<bool>(low.y && low.z), vec2<u32>(0u, 0u));
+    let b = psao_pair(table, x & vec2<bool>(high.y && low.z), vec2<u32>(1u, 0u));
+    let c = psao_pair(table, x & vec2<bool>(low.y && high.z), vec2<u32>(0u, 1u));
+    let d = psao_pair(table, x & vec2<bool>(high.y && high.z), vec2<u32>(1u, 1u));
+    return PsaoBlock(
+        vec4<u32>(a.cells, b.cells),
+        vec4<u32>(c.cells, d.cells),
+        a.unsure | (b.unsure << 2u) | (c.unsure << 4u) | (d.unsure << 6u),
+    );
+}
+
+// With the cell that one corner was found to be.
+fn psao_with(block: PsaoBlock, corner: u32, cell: u32) -> PsaoBlock {
+    let here = vec4<u32>(0u, 1u, 2u, 3u) == vec4<u32>(corner & 3u);
+    // Not select: GLSL ES has none for integer vectors.
+    let cells = vec4<u32>(here) * cell;
+    let high = vec4<u32>(select(0u, 0xffffffffu, corner >= 4u));
+    return PsaoBlock(block.lower | (cells & ~high), block.upper | (cells & high), block.unsure);
+}
+
+// Bits: the corners that may have a cell.
+fn psao_corners(block: PsaoBlock) -> u32 {
+    let bits = vec4<u32>(block.lower != vec4<u32>(0u)) * vec4<u32>(1u, 2u, 4u, 8u)
+        + vec4<u32>(block.upper != vec4<u32>(0u)) * vec4<u32>(16u, 32u, 64u, 128u);
+    return bits.x + bits.y + bits.z + bits.w;
+}
+
+fn psao_cell_at(block: PsaoBlock, offset: vec3<u32>) -> u32 {
+    let back = offset.y != 0u;
+    let lower = select(
+        select(block.lower.x, block.lower.z, back),
+        select(block.lower.y, block.lower.w, back),
+        offset.x != 0u,
+    );
+    let upper = select(
+        select(block.upper.x, block.upper.z, back),
+        select(block.upper.y, block.upper.w, back),
+        offset.x != 0u,
+    );
+    return select(lower, upper, offset.z != 0u);
+}
+
+// Up to three points of a cell; 0 where there is none. The third round is for the seventh point.
+struct PsaoRound {
+    points: vec3<u32>,
+    more: bool,
+}
+
+fn psao_round(cell: u32, key: u32, round: u32) -> PsaoRound {
+    let words = psao_load_cell(cell * 2u + min(round, 1u));
+    // Another key: another cell of the same tag. This one is not there.
+    let first = select(words.x, select(0u, words.y, words.x == key), round == 0u);
+    let a = select(first, words.w, round == 2u);
+    // A cell ends at its first empty word.
+    let b = select(select(words.y, words.z, round == 0u), 0u, a == 0u || round == 2u);
+    let c = select(select(words.z, words.w, round == 0u), 0u, b == 0u);
+    return PsaoRound(vec3<u32>(a, b, c), c != 0u);
+}
+
+// How much a cell counts for a fragment at this place in it.
+fn psao_share(place: vec3<f32>) -> f32 {
+    let sides = clamp((1.0 - abs(place - 0.5)) / PSAO_FADE, vec3<f32>(0.0), vec3<f32>(1.0));
+    return sides.x * sides.y * sides.z;
+}
+
+// A point as it is weighed.
+struct PsaoPoint {
+    // In its cell, half a step less.
+    place: vec3<f32>,
+    // Of any length: what is squared is divided by its square.
+    normal: vec3<f32>,
+    square: f32,
+    // In 1/255.
+    openness: f32,
+    // What it counts; 0 for what is no point.
+    seen: f32,
+}
+
+// Signed integers become floats in one step everywhere, unsigned ones do not.
+fn psao_point(point: u32) -> PsaoPoint {
+    let steps = vec3<i32>(vec3<u32>(point) & vec3<u32>(0x1f0000u, 0x3e00000u, 0x7c000000u));
+    let scale = vec3<f32>(0.03125 / 65536.0, 0.03125 / 2097152.0, 0.03125 / 67108864.0);
+    let codes = vec2<i32>(vec2<u32>(point >> 8u, point >> 12u) & vec2<u32>(15u));
+    let uv = vec2<f32>(min(codes, vec2<i32>(14))) - 7.0;
+    let z = 7.0 - abs(uv.x) - abs(uv.y);
+    let fold = max(-z, 0.0);
+    let m = vec3<f32>(uv - select(vec2<f32>(fold), vec2<f32>(-fold), uv < vec2<f32>(0.0)), z);
+    let openness = f32(i32(point & 255u));
+    let seen = min(openness * (1.0 / (255.0 * PSAO_SEEN)), 1.0) + PSAO_UNSEEN;
+    return PsaoPoint(
+        vec3<f32>(steps) * scale,
+        m,
+        fma(m.x, m.x, fma(m.y, m.y, m.z * m.z)),
+        openness,
+        select(seen, 0.0, i32(point) >= 0),
+    );
+}
+
+fn psao_dot(a: vec3<f32>, b: vec3<f32>) -> f32 {
+    return fma(a.x, b.x, fma(a.y, b.y, a.z * b.z));
+}
+
+// A blend that is being made, with one more point: the sum of the weights, and of the weighted
+// openness in 1/255. `place` is the fragment's in the cell, half a step less; `share` the cell's
+// part. The formula of psao_planar_weight, with one division.
+fn psao_add(
+    sums: vec2<f32>,
+    inverse_radius2: f32,
+    normal: vec3<f32>,
+    place: vec3<f32>,
+    share: f32,
+    word: u32,
+) -> vec2<f32> {
+    let point = psao_point(word);
+    let d = point.place - place;
+    let agree = max(psao_dot(point.normal, normal), 0.0);
+    let agree2 = max(agree * agree, (PSAO_T_N * PSAO_T_N) * point.square);
+    let along = psao_dot(normal, d);
+    let point_along = psao_dot(point.normal, d);
+    let h2 = max(along * along * point.square, point_along * point_along);
+    let near = fma(psao_dot(d, d), inverse_radius2, PSAO_CORE) * point.square;
+    let apart = fma(h2, PSAO_FLATNESS * inverse_radius2, near);
+    let ratio = agree2 * agree2 / (apart * point.square);
+    let weight = share * point.seen * (ratio * ratio);
+    return fma(vec2<f32>(weight), vec2<f32>(1.0, point.openness), sums);
 }
 
 fn psao_planar_fast(instance: u32, position: vec3<f32>, normal: vec3<f32>) -> f32 {
-    let grid = psao_grid(instance);
+    let grid = psao_grid_fast(instance);
     let fragment = psao_fragment(grid, position, normal);
     if fragment.outside {
         return 1.0;
     }
     // First all cells that may be there, then their points: fragments side by side spend as many
     // rounds as they have cells, and not always eight.
-    let inverse_count = 1.0 / f32(grid.bucket_count);
     let base = vec3<u32>(fragment.base);
-    let may_be_a = psao_candidate(grid, inverse_count, base);
-    let may_be_b = psao_candidate(grid, inverse_count, base + vec3<u32>(1u, 0u, 0u));
-    let may_be_c = psao_candidate(grid, inverse_count, base + vec3<u32>(0u, 1u, 0u));
-    let may_be_d = psao_candidate(grid, inverse_count, base + vec3<u32>(1u, 1u, 0u));
-    let may_be_e = psao_candidate(grid, inverse_count, base + vec3<u32>(0u, 0u, 1u));
-    let may_be_f = psao_candidate(grid, inverse_count, base + vec3<u32>(1u, 0u, 1u));
-    let may_be_g = psao_candidate(grid, inverse_count, base + vec3<u32>(0u, 1u, 1u));
-    let may_be_h = psao_candidate(grid, inverse_count, base + vec3<u32>(1u, 1u, 1u));
-    if may_be_a.unsure || may_be_b.unsure || may_be_c.unsure || may_be_d.unsure
-        || may_be_e.unsure || may_be_f.unsure || may_be_g.unsure || may_be_h.unsure {
-        return psao_planar(instance, position, normal);
+    let table = psao_table(grid, base);
+    var block = psao_block(grid, table, base, true);
+    while block.unsure != 0u {
+        let corner = psao_lowest(block.unsure);
+        let offset = psao_corner(corner);
+        let found = psao_search(psao_bucket(table, offset), psao_key(table, offset));
+        block = psao_with(block, corner, found);
+        block.unsure &= block.unsure - 1u;
     }
-    var left = select(0u, 1u, may_be_a.cell != 0u) | select(0u, 2u, may_be_b.cell != 0u)
-        | select(0u, 4u, may_be_c.cell != 0u) | select(0u, 8u, may_be_d.cell != 0u)
-        | select(0u, 16u, may_be_e.cell != 0u) | select(0u, 32u, may_be_f.cell != 0u)
-        | select(0u, 64u, may_be_g.cell != 0u) | select(0u, 128u, may_be_h.cell != 0u);
+    var left = psao_corners(block);
     let inverse_radius2 = 1.0 / (grid.radius * grid.radius);
     var sums = vec2<f32>(0.0);
-    // A round takes half a cell, without branches: the first three points, then the other four.
-    var second = false;
+    var round = 0u;
     while left != 0u {
-        // Which bit is the lowest: the exponent of that bit as a float. GLSL ES 3.00 cannot say.
-        let corner = (bitcast<u32>(f32(i32(left & (0u - left)))) >> 23u) - 127u;
-        let offset = vec3<u32>(corner, corner >> 1u, corner >> 2u) & vec3<u32>(1u);
-        let right = offset.x != 0u;
-        let back = offset.y != 0u;
-        let lower = select(
-            select(may_be_a.cell, may_be_b.cell, right),
-            select(may_be_c.cell, may_be_d.cell, right),
-            back,
-        );
-        let upper = select(
-            select(may_be_e.cell, may_be_f.cell, right),
-            select(may_be_g.cell, may_be_h.cell, right),
-            back,
-        );
-        let found = select(lower, upper, offset.z != 0u);
-        var words = psao_load_cell(found * 2u + select(0u, 1u, second));
-        if !second && words.x != psao_weigh(grid, base + offset, 1u, 1u) {
-            // Another cell of the same tag: this one is not there.
-            words = vec4<u32>(0u);
-        }
-        // A cell ends at its first empty word.
-        let a = select(0u, words.x, second);
-        let b = select(words.y, 0u, second && a == 0u);
-        let c = select(0u, words.z, b != 0u);
-        let d = select(0u, words.w, c != 0u);
-        let side = psao_side(fragment.place, offset);
-        let place = fragment.place - 0.015625 - vec3<f32>(vec3<i32>(offset));
-        if second {
-            psao_add(&sums, inverse_radius2, fragment.normal, place, side, a);
-        }
-        psao_add(&sums, inverse_radius2, fragment.normal, place, side, b);
-        psao_add(&sums, inverse_radius2, fragment.normal, place, side, c);
-        psao_add(&sums, inverse_radius2, fragment.normal, place, side, d);
-        second = !second && d != 0u;
-        left = select(left & (left - 1u), left, second);
+        let offset = psao_corner(psao_lowest(left));
+        let now = psao_round(psao_cell_at(block, offset), psao_key(table, offset), round);
+        let at = fragment.place - vec3<f32>(vec3<i32>(offset));
+        let share = psao_share(at);
+        let place = at - 0.015625;
+        sums = psao_add(sums, inverse_radius2, fragment.normal, place, share, now.points.x);
+        sums = psao_add(sums, inverse_radius2, fragment.normal, place, share, now.points.y);
+        sums = psao_add(sums, inverse_radius2, fragment.normal, place, share, now.points.z);
+        round = select(0u, round + 1u, now.more);
+        left = select(left & (left - 1u), left, now.more);
     }
     return select(1.0, min(sums.y / sums.x * (1.0 / 255.0), 1.0), sums.x > 0.0);
 }

@@ -257,6 +257,95 @@ static void check_order(bytes stream) {
     free(made.block);
 }
 
+/* Buckets with tags: the same entries, a tag above each, or none at all. */
+static void check_tags(bytes stream) {
+    psao_config config = config_of(stream);
+    owned made = make(&config);
+    psao_client *client = made.client;
+    psao_frame frame;
+    memset(&frame, 0, sizeof frame);
+    frame.struct_size = sizeof frame;
+    psao_bucket out[2];
+    size_t used;
+    GIVES(PSAO_ERROR_ORDER, psao_client_tag_buckets(client, 0, 1, out));
+    GIVES(PSAO_OK, psao_client_push(client, stream.data, stream.size, 0, &used));
+    GIVES(PSAO_OK, psao_client_take(client, &frame));
+    GIVES(PSAO_ERROR_NULL, psao_client_tag_buckets(NULL, 0, 1, out));
+    GIVES(PSAO_ERROR_NULL, psao_client_tag_buckets(client, 0, 1, NULL));
+    GIVES(PSAO_OK, psao_client_tag_buckets(client, 0, 0, NULL));
+    GIVES(PSAO_ERROR_VALUE, psao_client_tag_buckets(client, frame.bucket_count, 1, out));
+    GIVES(PSAO_ERROR_VALUE, psao_client_tag_buckets(client, 1, frame.bucket_count, out));
+    GIVES(PSAO_ERROR_VALUE, psao_client_tag_buckets(client, 0xffffffff, 0, out));
+    uint32_t tagged = 0;
+    for (uint32_t i = 0; i < frame.bucket_count; i++) {
+        memset(out, 0xee, sizeof out);
+        GIVES(PSAO_OK, psao_client_tag_buckets(client, i, 1, out));
+        CHECK(out[1].entries[0] == 0xeeeeeeee);
+        const uint32_t *plain = frame.buckets[i].entries;
+        int bare = memcmp(out[0].entries, plain, sizeof(psao_bucket)) == 0;
+        for (int entry = 0; entry < 8 && plain[entry] != 0; entry++) {
+            uint32_t tag = frame.cells[plain[entry]].key * 0x9e3779b1u >> 22;
+            if (tag == 0)
+                tag = 1;
+            CHECK(bare || out[0].entries[entry] == (plain[entry] | tag << 22));
+            tagged += !bare;
+        }
+    }
+    CHECK(tagged > 100);
+    free(made.block);
+}
+
+/* Buffers that were lost: the newest frame comes again, and all of it is dirty. */
+static void check_again(bytes stream, uint32_t two_threads) {
+    psao_config config = config_of(stream);
+    config.two_threads = two_threads;
+    owned made = make(&config);
+    psao_client *client = made.client;
+    psao_frame frame;
+    memset(&frame, 0, sizeof frame);
+    frame.struct_size = sizeof frame;
+    psao_range ranges[4];
+    uint32_t count;
+    size_t used, at_byte = 0;
+    GIVES(PSAO_ERROR_NULL, psao_client_mark_all_dirty(NULL));
+    /* Before the first frame there is nothing to give again. */
+    GIVES(PSAO_OK, psao_client_mark_all_dirty(client));
+    GIVES(PSAO_NOTHING_NEW, psao_client_take(client, &frame));
+    for (int round = 0; round < 3; round++) {
+        GIVES(PSAO_OK, push_from(client, stream, at_byte, &used));
+        at_byte += used;
+        GIVES(PSAO_OK, psao_client_take(client, &frame));
+        uint32_t shown = frame.frame_id;
+        GIVES(PSAO_ERROR_ORDER, psao_client_mark_all_dirty(client));
+        GIVES(PSAO_OK, psao_client_release(client));
+        GIVES(PSAO_NOTHING_NEW, psao_client_take(client, &frame));
+
+        GIVES(PSAO_OK, psao_client_mark_all_dirty(client));
+        GIVES(PSAO_OK, psao_client_take(client, &frame));
+        CHECK(frame.frame_id == shown);
+        for (uint32_t buffer = 0; buffer < 3; buffer++) {
+            uint32_t counts[3];
+            counts[0] = frame.instance_count, counts[1] = frame.bucket_count;
+            counts[2] = frame.cell_count;
+            GIVES(PSAO_OK, psao_client_dirty_ranges(client, buffer, 0, ranges, 4, &count));
+            CHECK(count == 1 && ranges[0].first_index == 0 && ranges[0].count == counts[buffer]);
+        }
+        GIVES(PSAO_OK, psao_client_release(client));
+        GIVES(PSAO_NOTHING_NEW, psao_client_take(client, &frame));
+    }
+    /* Half a frame is not shown for that: the next whole one is. */
+    GIVES(PSAO_OK, psao_client_mark_all_dirty(client));
+    size_t half = stream.size - at_byte > 60 ? 60 : 1;
+    GIVES(PSAO_NEED_MORE, psao_client_push(client, stream.data + at_byte, half, 0, &used));
+    at_byte += used;
+    GIVES(PSAO_OK, push_from(client, stream, at_byte, &used));
+    GIVES(PSAO_OK, psao_client_take(client, &frame));
+    GIVES(PSAO_OK, psao_client_dirty_ranges(client, PSAO_BUFFER_CELLS, 0, ranges, 4, &count));
+    CHECK(count == 1 && ranges[0].count == frame.cell_count);
+    GIVES(PSAO_OK, psao_client_release(client));
+    free(made.block);
+}
+
 static void check_capacity(bytes stream) {
     psao_config config = config_of(stream);
     size_t used;
@@ -369,6 +458,9 @@ int main(int count, char **words) {
     check_versions();
     check_config(stream);
     check_order(stream);
+    check_tags(stream);
+    check_again(stream, 0);
+    check_again(stream, 1);
     check_capacity(stream);
     check_uplink(stream);
     check_damage(stream);

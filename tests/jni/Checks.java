@@ -281,6 +281,23 @@ public final class Checks {
         thrown(IndexOutOfBoundsException.class, () -> frame.rangeFirst(-1));
         thrown(ReadOnlyBufferException.class, () -> frame.buffer(0).put(0, (byte) 1));
 
+        // Buckets with tags.
+        int buckets = frame.count(PsaoFrame.BUCKETS);
+        PsaoBuffer tagged = new PsaoBuffer(32 * buckets);
+        frame.tagBuckets(0, buckets, tagged);
+        int tags = 0;
+        for (int at = 0; at < 32 * buckets; at += 4) {
+            int entry = tagged.bytes().getInt(at);
+            equal(frame.buffer(PsaoFrame.BUCKETS).getInt(at), entry & 0x3fffff);
+            tags += entry >>> 22 == 0 ? 0 : 1;
+        }
+        check(tags > 100, tags + " tags");
+        fails(PsaoResult.ERROR_VALUE, () -> frame.tagBuckets(1, buckets, tagged));
+        thrown(IllegalArgumentException.class, () -> frame.tagBuckets(-1, 1, tagged));
+        thrown(IllegalArgumentException.class, () -> frame.tagBuckets(0, -1, tagged));
+        thrown(IllegalArgumentException.class, () -> frame.tagBuckets(0, buckets + 1, tagged));
+        thrown(NullPointerException.class, () -> frame.tagBuckets(0, 1, null));
+
         // Lookups.
         PsaoBuffer points = new PsaoBuffer(24);
         PsaoBuffer two = new PsaoBuffer(8);
@@ -298,9 +315,19 @@ public final class Checks {
         PsaoBuffer within = new PsaoBuffer(points.bytes());
         thrown(IllegalArgumentException.class, () -> client.lookup(0, points, points, 1, within));
         fails(PsaoResult.ERROR_VALUE, () -> client.lookup(0, unaligned, points, 2, two));
+        fails(PsaoResult.ERROR_ORDER, client::markAllDirty);
         client.release();
         fails(PsaoResult.ERROR_ORDER, () -> frame.dirtyRanges(0, 0));
+        fails(PsaoResult.ERROR_ORDER, () -> frame.tagBuckets(0, 1, tagged));
         thrown(IndexOutOfBoundsException.class, () -> frame.range(0));
+
+        // All of it again, into buffers that were made anew.
+        check(client.take() == null, "a frame twice");
+        client.markAllDirty();
+        check(client.take() == frame, "no frame again");
+        equal(1, frame.dirtyRanges(PsaoFrame.CELLS, 0));
+        equal(frame.count(PsaoFrame.CELLS), frame.rangeCount(0));
+        client.release();
 
         // Failed streams say why, until a restart.
         PsaoBuffer damaged = stream("packet-missing");
@@ -325,7 +352,8 @@ public final class Checks {
         client.close();
         List<Act> all = Arrays.asList(
                 () -> client.push(stream, 0), client::restart, client::take, client::release,
-                client::topologyHash, client::nativeClient,
+                client::topologyHash, client::nativeClient, client::markAllDirty,
+                () -> frame.tagBuckets(0, 1, tagged),
                 () -> client.header(new PsaoHeader()), () -> client.stats(new PsaoStats()),
                 () -> client.status(0, status), () -> frame.dirtyRanges(0, 0),
                 () -> client.lookup(0, points, points, 2, two));

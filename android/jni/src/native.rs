@@ -488,6 +488,22 @@ pub unsafe extern "system" fn Java_org_psao_Native_dirtyRanges(
 }
 
 #[unsafe(no_mangle)]
+pub unsafe extern "system" fn Java_org_psao_Native_tagBuckets(
+    _: EnvUnowned<'_>,
+    _: JClass<'_>,
+    client: jlong,
+    first_index: jint,
+    count: jint,
+    out_buckets: jlong,
+    _keep: JObject<'_>,
+    _keep_out: JObject<'_>,
+) -> jint {
+    let (first, count, out) = (first_index as u32, count as u32, at(out_buckets));
+    // SAFETY: the module's rules.
+    unsafe { psao_client_tag_buckets(at(client), first, count, out) as jint }
+}
+
+#[unsafe(no_mangle)]
 pub unsafe extern "system" fn Java_org_psao_Native_lookup(
     _: EnvUnowned<'_>,
     _: JClass<'_>,
@@ -526,6 +542,17 @@ pub unsafe extern "system" fn Java_org_psao_Native_release(
 ) -> jint {
     // SAFETY: the module's rules.
     unsafe { psao_client_release(at(client)) as jint }
+}
+
+#[unsafe(no_mangle)]
+pub unsafe extern "system" fn Java_org_psao_Native_markAllDirty(
+    _: EnvUnowned<'_>,
+    _: JClass<'_>,
+    client: jlong,
+    _keep: JObject<'_>,
+) -> jint {
+    // SAFETY: the module's rules.
+    unsafe { psao_client_mark_all_dirty(at(client)) as jint }
 }
 
 /// Bytes of the message, as with all that follow.

@@ -381,6 +381,11 @@ impl Client {
         }
     }
 
+    /// Nothing counts as uploaded: for buffers that were lost with their device, or made anew.
+    pub fn mark_all_dirty(&mut self) {
+        self.decoder.mirror.mark_all_dirty();
+    }
+
     /// What changed has been uploaded.
     pub fn clear_dirty(&mut self) {
         self.decoder.mirror.clear_dirty();

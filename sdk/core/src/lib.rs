@@ -12,6 +12,7 @@
 //! * [`slices`]: patches on instances, whose points [`bins`] puts into cells.
 //! * [`residual`], over [`range`]: the coding of a slice's occlusion.
 //! * [`uplink`]: what the client tells the server.
+//! * [`tags`]: what a GPU's buckets say of their cells' keys.
 //! * [`lookup`]: the blend of the few points around a fragment; the definition for all shaders.
 //!
 //! `no_std`, no allocation, no `unsafe`: every buffer is the caller's and is bounded before use.
@@ -28,6 +29,7 @@ pub mod range;
 pub mod residual;
 pub mod slices;
 pub mod stream;
+pub mod tags;
 pub mod topology;
 pub mod uplink;
 mod usual;

@@ -100,6 +100,22 @@ pub struct PartsMut<'a> {
     pub dirty: &'a mut [u64],
 }
 
+impl PartsMut<'_> {
+    /// Nothing counts as uploaded.
+    pub fn mark_all_dirty(&mut self) {
+        let capacity = Capacity {
+            instances: self.instances.len() as u32,
+            buckets: self.buckets.len() as u32,
+            cells: self.cells.len() as u32,
+            ..Capacity::default()
+        };
+        let (instances, buckets, cells) = split_sets(self.dirty, capacity);
+        dirty::mark_all(instances, capacity.instances as usize);
+        dirty::mark_all(buckets, capacity.buckets as usize);
+        dirty::mark_all(cells, capacity.cells as usize);
+    }
+}
+
 /// Why a change was refused. The mirror is as before.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum MirrorError {
@@ -219,7 +235,8 @@ impl<M: Memory> Mirror<M> {
         Ok(())
     }
 
-    /// Sets one bucket.
+    /// Sets one bucket. It is dirty from now on, changed or not: a cell that it names may have
+    /// another key, and so it another tag (see [`crate::tags`]).
     pub fn set_bucket(&mut self, index: u32, value: Bucket) -> Result<(), MirrorError> {
         let capacity = self.capacity();
         if index >= capacity.buckets {
@@ -235,6 +252,7 @@ impl<M: Memory> Mirror<M> {
         let parts = self.memory.parts_mut();
         let (_, set, _) = split_sets(parts.dirty, capacity);
         replace(parts.buckets, set, index, value, 2, &mut self.hash);
+        dirty::mark(set, capacity.buckets as usize, index as usize);
         Ok(())
     }
 
@@ -353,6 +371,11 @@ impl<M: Memory> Mirror<M> {
     pub fn dirty_runs(&self, buffer: Buffer) -> impl Iterator<Item = Range<u32>> + '_ {
         let (set, len) = self.dirty_set(buffer);
         dirty::runs(set, len).map(|run| run.start as u32..run.end as u32)
+    }
+
+    /// Nothing counts as uploaded: for buffers that were made anew, or lost with their device.
+    pub fn mark_all_dirty(&mut self) {
+        self.memory.parts_mut().mark_all_dirty();
     }
 
     /// Everything counts as uploaded.
@@ -562,6 +585,37 @@ mod tests {
                 assert_eq!(not_zero(&bytes), all ^ 1 << at);
             }
         }
+    }
+
+    #[test]
+    fn a_bucket_that_is_set_again_is_dirty_for_its_cells_may_have_other_keys() {
+        with_mirror(|mirror| {
+            let entries = [7, 0, 0, 0, 0, 0, 0, 0];
+            for key in [1, 2] {
+                mirror.set_cell(7, cell(key)).unwrap();
+                mirror.set_bucket(3, Bucket { entries }).unwrap();
+                assert_eq!(mirror.next_dirty(Buffer::Buckets, 0), Some(3..4));
+                mirror.clear_dirty();
+            }
+            assert_eq!(mirror.hash(), mirror.recompute_hash());
+        });
+    }
+
+    #[test]
+    fn everything_can_be_made_dirty_again() {
+        with_mirror(|mirror| {
+            mirror.mark_all_dirty();
+            let capacity = mirror.capacity();
+            for (buffer, count) in [
+                (Buffer::Instances, capacity.instances),
+                (Buffer::Buckets, capacity.buckets),
+                (Buffer::Cells, capacity.cells),
+            ] {
+                assert_eq!(mirror.next_dirty(buffer, 0), Some(0..count));
+            }
+            mirror.clear_dirty();
+            assert_eq!(mirror.next_dirty(Buffer::Cells, 0), None);
+        });
     }
 
     #[test]

@@ -11,6 +11,7 @@ use core::fmt::Write;
 use core::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
 use psao::core::mirror::{Buffer, Capacity};
 use psao::core::stream::{Frame, Header, PREAMBLE, Packet, kind};
+use psao::core::{Bucket, tags};
 use psao::memory::{Limits, Line, Source};
 use psao::{Client, ClientError, State};
 
@@ -34,6 +35,8 @@ pub struct psao_client {
     state: AtomicU32,
     live_ns: AtomicU64,
     shown: AtomicBool,
+    /// The taker wants all of the frame, even if it had it before.
+    again: AtomicBool,
     front: Handoff<Front>,
     /// The pusher's; with one thread, the taker's too while it has a frame.
     pusher: UnsafeCell<Pusher>,
@@ -359,6 +362,7 @@ pub unsafe extern "C" fn psao_client_init(
             state: AtomicU32::new(State::Connecting as u32),
             live_ns: AtomicU64::new(0),
             shown: AtomicBool::new(false),
+            again: AtomicBool::new(false),
             front: Handoff::new(front),
             pusher: UnsafeCell::new(Pusher {
                 client,
@@ -479,6 +483,34 @@ impl psao_client {
             PSAO_NEED_MORE
         };
         Ok((result, pushed.consumed))
+    }
+
+    /// Takes the newest frame: one that the taker has not had, or any if it wants all of it again.
+    fn take(&self) -> bool {
+        if !self.again.load(Ordering::Relaxed) {
+            return self.front.take();
+        }
+        if self.two_threads {
+            let mut any = false;
+            if !self.front.take_again() {
+                return false;
+            }
+            self.front.change(|front| any = front.mark_all_dirty());
+            if !any {
+                self.front.release(|_| ());
+                return false;
+            }
+        } else {
+            // SAFETY: one thread, and it takes, so it does not push.
+            let pusher = unsafe { self.pusher() };
+            // A frame may have begun to come since.
+            if !pusher.client.is_whole() || !self.front.take_again() {
+                return false;
+            }
+            pusher.client.mark_all_dirty();
+        }
+        self.again.store(false, Ordering::Relaxed);
+        true
     }
 
     /// What the taker has now.
@@ -783,7 +815,7 @@ pub unsafe extern "C" fn psao_client_take(
             if client.front.taken(|_| ()).is_some() {
                 return Err(PSAO_ERROR_ORDER);
             }
-            if !client.front.take() {
+            if !client.take() {
                 return Ok(PSAO_NOTHING_NEW);
             }
             let frame = client.with_taken(|front, shown| {
@@ -863,6 +895,53 @@ pub unsafe extern "C" fn psao_client_dirty_ranges(
     }
 }
 
+/// Copies buckets with a tag in each entry, which psao_planar_fast of the shaders wants: above the
+/// cell's index (22 bits), a few bits of the cell's key, so that no cell is read in vain. Copy the
+/// dirty ranges of PSAO_BUFFER_BUCKETS so, and upload the copies; a bucket is dirty, too, where
+/// just a tag changed. psao_planar and psao_paper work with tags and without.
+///
+/// out_buckets: count of them.
+///
+/// PSAO_ERROR_VALUE: the range is not within the frame's buckets. PSAO_ERROR_CAPACITY: the frame
+/// has more than 4194304 cells, so that their indices leave no room: upload the buckets as they
+/// are, and call psao_planar. PSAO_ERROR_ORDER: no frame is taken.
+///
+/// Threads: taker. Time: grows with count. No alloc, lock or log. Since ABI 1.
+///
+/// # Safety
+/// The pointers are as described.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn psao_client_tag_buckets(
+    client: *const psao_client,
+    first_index: u32,
+    count: u32,
+    out_buckets: *mut psao_bucket,
+) -> psao_result {
+    // SAFETY: the caller's word; it is the taker's.
+    unsafe {
+        with(client, |client| {
+            if out_buckets.is_null() && count > 0 {
+                return Err(PSAO_ERROR_NULL);
+            }
+            client.with_taken(|_, shown| {
+                let lookup = shown.buffers();
+                let rest = lookup.buckets.get(first_index as usize..);
+                let run = rest.and_then(|rest| rest.get(..count as usize));
+                let run = run.ok_or(PSAO_ERROR_VALUE)?;
+                if lookup.cells.len() > tags::MAX_CELLS as usize {
+                    return Err(PSAO_ERROR_CAPACITY);
+                }
+                let out: *mut Bucket = out_buckets.cast();
+                for (at, bucket) in run.iter().enumerate() {
+                    let tagged = tags::tagged(bucket, lookup.cells);
+                    out.add(at).write_unaligned(tagged);
+                }
+                Ok(PSAO_OK)
+            })
+        })
+    }
+}
+
 /// Looks ambient occlusion up at points of one instance, on the CPU: what the shader does for
 /// each fragment.
 ///
@@ -934,6 +1013,31 @@ pub unsafe extern "C" fn psao_client_release(client: *mut psao_client) -> psao_r
             } else {
                 Err(PSAO_ERROR_ORDER)
             }
+        })
+    }
+}
+
+/// Makes everything dirty: call it when your buffers were lost with their device, or made anew.
+/// The next psao_client_take then gives the newest frame, even if you had it before, and its
+/// ranges cover the whole buffers.
+///
+/// PSAO_ERROR_ORDER: a frame is taken; release it first.
+///
+/// Threads: taker. Time: constant; the next psao_client_take's grows with the capacity. No alloc,
+/// lock or log. Since ABI 1.
+///
+/// # Safety
+/// The pointer is as described.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn psao_client_mark_all_dirty(client: *mut psao_client) -> psao_result {
+    // SAFETY: the caller's word; it is the taker's.
+    unsafe {
+        with(client, |client| {
+            if client.front.taken(|_| ()).is_some() {
+                return Err(PSAO_ERROR_ORDER);
+            }
+            client.again.store(true, Ordering::Relaxed);
+            Ok(PSAO_OK)
         })
     }
 }

@@ -52,6 +52,13 @@ impl Front {
         copy(cells, mirror.cells(), runs(Buffer::Cells), cell_set);
     }
 
+    /// The taker has nothing of it. Says whether there is anything: not before the first frame.
+    pub fn mark_all_dirty(&mut self) -> bool {
+        let mut parts = self.copy.parts_mut();
+        parts.mark_all_dirty();
+        !parts.buckets.is_empty()
+    }
+
     /// The taker has what was dirty.
     pub fn clear_dirty(&mut self) {
         let PartsMut {

@@ -80,6 +80,11 @@ impl<T> Handoff<T> {
         self.step(READY, READING)
     }
 
+    /// Reader: takes the value, written since or not, unless the writer is at work on it.
+    pub fn take_again(&self) -> bool {
+        self.step(READY, READING) || self.step(IDLE, READING)
+    }
+
     /// Reader: looks at the value between [`Handoff::take`] and [`Handoff::release`], else `None`.
     pub fn taken<R>(&self, look: impl FnOnce(&T) -> R) -> Option<R> {
         // Only the reader itself leaves this state.
@@ -89,15 +94,23 @@ impl<T> Handoff<T> {
         })
     }
 
-    /// Reader: gives the value back, after a last change. Says whether it had it.
-    pub fn release(&self, change: impl FnOnce(&mut T)) -> bool {
+    /// Reader: changes the value between [`Handoff::take`] and [`Handoff::release`], else nothing.
+    pub fn change(&self, change: impl FnOnce(&mut T)) -> bool {
         if self.state.load(Ordering::Relaxed) != READING {
             return false;
         }
         // SAFETY: as in `taken`.
         self.value.with_mut(|value| change(unsafe { &mut *value }));
-        self.state.store(IDLE, Ordering::Release);
         true
+    }
+
+    /// Reader: gives the value back, after a last change. Says whether it had it.
+    pub fn release(&self, change: impl FnOnce(&mut T)) -> bool {
+        let had = self.change(change);
+        if had {
+            self.state.store(IDLE, Ordering::Release);
+        }
+        had
     }
 }
 

@@ -1,6 +1,7 @@
 //! The mirror's three buffers on the GPU, and uploads of what changed.
 
 use psao_core::mirror::{Buffer, Capacity, Memory};
+use psao_core::tags;
 use psao_core::{Bucket, Cell, Instance, Mirror};
 use std::fmt;
 use std::ops::Range;
@@ -9,7 +10,7 @@ use wgpu::util::StagingBelt;
 /// Instances, buckets and cells on the GPU, as large as the stream may ever need: they never grow
 /// and never move, so bind groups stay valid.
 ///
-/// They are the mirror's, but for a tag of its key above each cell's index in a bucket: it spares
+/// They are the mirror's, but for the tags in the buckets ([`psao_core::tags`]), which spare
 /// [`crate::Tier::Fast`] from reading cells that it does not look for.
 ///
 /// Use it from one thread at a time.
@@ -21,18 +22,8 @@ pub struct Buffers {
     group: wgpu::BindGroup,
     capacity: Capacity,
     belt: StagingBelt,
-    tags: Tags,
     /// What the present upload copies.
     plan: Vec<(Buffer, Range<u32>)>,
-}
-
-/// What the buckets on the GPU say of the cells.
-#[derive(Debug)]
-struct Tags {
-    /// The bucket that names a cell, and the tag that it has there; 0 for none.
-    of_cells: Vec<(u32, u16)>,
-    /// Some buckets of a run, with tags.
-    run: [Bucket; 64],
 }
 
 /// A buffer is larger than the device can bind, or than entries of buckets can name.
@@ -71,9 +62,6 @@ pub struct Uploaded {
     pub copies: u32,
 }
 
-/// A bucket's entry has this many bits for the cell's index: a cell buffer of 128 MiB.
-const INDEX_BITS: u32 = 22;
-
 const NAMES: [&str; 3] = ["psao instances", "psao buckets", "psao cells"];
 const KINDS: [Buffer; 3] = [Buffer::Instances, Buffer::Buckets, Buffer::Cells];
 const STRIDES: [u64; 3] = [
@@ -100,7 +88,7 @@ impl Buffers {
         let limit_bytes = limits
             .max_storage_buffer_binding_size
             .min(limits.max_buffer_size)
-            .min(STRIDES[2] << INDEX_BITS);
+            .min(STRIDES[2] * u64::from(tags::MAX_CELLS));
         // At least one of each: an empty buffer cannot be bound.
         let sizes: [u64; 3] =
             std::array::from_fn(|kind| u64::from(counts[kind].max(1)) * STRIDES[kind]);
@@ -148,10 +136,6 @@ impl Buffers {
         });
         Ok(Buffers {
             belt: StagingBelt::new(device.clone(), CHUNK_BYTES),
-            tags: Tags {
-                of_cells: vec![(0, 0); capacity.cells as usize],
-                run: [Bucket::default(); 64],
-            },
             plan: Vec::new(),
             device: device.clone(),
             buffers,
@@ -161,7 +145,8 @@ impl Buffers {
         })
     }
 
-    /// Copies what changed since [`Mirror::clear_dirty`], which is the caller's to call next. The
+    /// Copies what changed since [`Mirror::clear_dirty`], which is the caller's to call next; all
+    /// of it into new buffers, after [`Mirror::mark_all_dirty`]. The
     /// copies are recorded at `encoder`'s end: submit it, and before anything that is to see them.
     ///
     /// Never waits for the GPU: staging memory that is still in use is left alone, and comes back
@@ -199,7 +184,11 @@ impl Buffers {
             let elements = run.start as usize..run.end as usize;
             match kind {
                 Buffer::Instances => fill(bytemuck::cast_slice(&mirror.instances()[elements])),
-                Buffer::Buckets => self.tags.tag(mirror, elements, &mut fill),
+                Buffer::Buckets => {
+                    for bucket in &mirror.buckets()[elements] {
+                        fill(bytemuck::bytes_of(&tags::tagged(bucket, mirror.cells())));
+                    }
+                }
                 Buffer::Cells => fill(bytemuck::cast_slice(&mirror.cells()[elements])),
             }
             let stride = STRIDES[*kind as usize];
@@ -237,25 +226,6 @@ impl Buffers {
                 self.plan.push((kind, run));
             }
         }
-        // A cell may have another key in the same entry of the same bucket: that has an old tag.
-        for index in mirror.dirty_runs(Buffer::Cells).flatten() {
-            let (bucket, tag) = self.tags.of_cells[index as usize];
-            let named = |bucket: &Bucket| bucket.cells().any(|entry| entry == index);
-            let planned = || {
-                let next = mirror.next_dirty(Buffer::Buckets, bucket);
-                next.is_some_and(|run| run.start == bucket)
-            };
-            if tag != 0
-                && tag != tag_of(mirror.cells()[index as usize].key)
-                && mirror.buckets().get(bucket as usize).is_some_and(named)
-                && !planned()
-            {
-                let run = bucket..bucket + 1;
-                done.dirty_bytes += bytes_of(Buffer::Buckets, &run);
-                done.bytes += bytes_of(Buffer::Buckets, &run);
-                self.plan.push((Buffer::Buckets, run));
-            }
-        }
         done.copies = self.plan.len() as u32;
         done
     }
@@ -278,38 +248,8 @@ impl Buffers {
     }
 }
 
-impl Tags {
-    /// Puts out the buckets of a run, each entry with its cell's tag.
-    fn tag<M: Memory>(
-        &mut self,
-        mirror: &Mirror<M>,
-        run: Range<usize>,
-        mut out: impl FnMut(&[u8]),
-    ) {
-        for first in run.clone().step_by(self.run.len()) {
-            let buckets = &mirror.buckets()[first..run.end.min(first + self.run.len())];
-            let tagged = &mut self.run[..buckets.len()];
-            tagged.copy_from_slice(buckets);
-            for (index, bucket) in (first as u32..).zip(&mut *tagged) {
-                for entry in bucket.entries.iter_mut().take_while(|entry| **entry != 0) {
-                    // A mirror's buckets name only cells that it has.
-                    let tag = tag_of(mirror.cells()[*entry as usize].key);
-                    self.of_cells[*entry as usize] = (index, tag);
-                    *entry |= u32::from(tag) << INDEX_BITS;
-                }
-            }
-            out(bytemuck::cast_slice(tagged));
-        }
-    }
-}
-
 fn bytes_of(kind: Buffer, run: &Range<u32>) -> u64 {
     u64::from(run.end - run.start) * STRIDES[kind as usize]
-}
-
-/// `psao_tag` of psao.wgsl.
-fn tag_of(key: u32) -> u16 {
-    (key.wrapping_mul(0x9e37_79b1) >> INDEX_BITS).max(1) as u16
 }
 
 impl Uploaded {

@@ -20,6 +20,8 @@ pub enum Tier {
 pub struct Pass {
     pipeline: wgpu::ComputePipeline,
     layout: wgpu::BindGroupLayout,
+    /// Pixels of a workgroup, across and down.
+    tile: [u32; 2],
 }
 
 /// What a pass reads and writes. Made when the textures are, used every frame.
@@ -28,9 +30,6 @@ pub struct GBuffer {
     group: wgpu::BindGroup,
     tiles: [u32; 2],
 }
-
-/// Edge of the square of pixels that a workgroup computes.
-const TILE: u32 = 8;
 
 const ENTRIES: &str = include_str!("pass.wgsl");
 
@@ -74,10 +73,10 @@ impl Pass {
             bind_group_layouts: &[Some(buffers.bind_group_layout()), Some(&layout)],
             immediate_size: 0,
         });
-        let entry = match (kernel, tier) {
-            (Kernel::Paper, _) => "psao_pass_paper",
-            (Kernel::Planar, Tier::Exact) => "psao_pass_planar",
-            (Kernel::Planar, Tier::Fast) => "psao_pass_fast",
+        let (entry, tile) = match (kernel, tier) {
+            (Kernel::Paper, _) => ("psao_pass_paper", [8, 8]),
+            (Kernel::Planar, Tier::Exact) => ("psao_pass_planar", [8, 8]),
+            (Kernel::Planar, Tier::Fast) => ("psao_pass_fast", [16, 8]),
         };
         let pipeline = device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
             label: Some(entry),
@@ -87,7 +86,11 @@ impl Pass {
             compilation_options: wgpu::PipelineCompilationOptions::default(),
             cache: None,
         });
-        Pass { pipeline, layout }
+        Pass {
+            pipeline,
+            layout,
+            tile,
+        }
     }
 
     /// Names the textures to work on; all must be of the same size.
@@ -116,7 +119,10 @@ impl Pass {
                 layout: &self.layout,
                 entries: &[entry(0, position), entry(1, normal), entry(2, openness)],
             }),
-            tiles: [size.width.div_ceil(TILE), size.height.div_ceil(TILE)],
+            tiles: [
+                size.width.div_ceil(self.tile[0]),
+                size.height.div_ceil(self.tile[1]),
+            ],
         }
     }
 

@@ -37,9 +37,50 @@ struct PsaoFragment {
     bool outside;
 };
 
+struct PsaoTable {
+    uint key;
+    uint hash;
+    uint row;
+    uint layer;
+    uint bucket_first;
+    uint bucket_count;
+    float inverse_count;
+};
+
 struct PsaoCandidate {
     uint cell;
-    bool unsure;
+    uint unsure;
+};
+
+struct PsaoPair {
+    uint2 cells;
+    uint unsure;
+    int _end_pad_0;
+};
+
+struct PsaoBlock {
+    uint4 lower;
+    uint4 upper;
+    uint unsure;
+    int _end_pad_0;
+    int _end_pad_1;
+    int _end_pad_2;
+};
+
+struct PsaoRound {
+    uint3 points;
+    bool more;
+};
+
+struct PsaoPoint {
+    float3 place;
+    int _pad1_0;
+    float3 normal;
+    float square;
+    float openness;
+    float seen;
+    int _end_pad_0;
+    int _end_pad_1;
 };
 
 static const float PSAO_T_N = 0.1;
@@ -139,44 +180,50 @@ uint psao_weigh(PsaoGrid grid_1, uint3 cell, uint weight_y, uint weight_z)
     return ((cell.x + ((cell.y * grid_1.dims.x) * weight_y)) + ((cell.z * (grid_1.dims.x * grid_1.dims.y)) * weight_z));
 }
 
+uint psao_search(uint bucket, uint key)
+{
+    uint i = 0u;
+
+    bool loop_init = true;
+    while(true) {
+        if (!loop_init) {
+            uint _e27 = i;
+            i = (_e27 + 1u);
+        }
+        loop_init = false;
+        uint _e4 = i;
+        if ((_e4 < 8u)) {
+        } else {
+            break;
+        }
+        {
+            uint _e9 = i;
+            const uint4 _e13 = psao_load_bucket(((bucket * 2u) + (_e9 >> 2u)));
+            uint _e14 = i;
+            uint entry = (_e13[(_e14 & 3u)] & PSAO_ENTRY_CELL);
+            if ((entry == 0u)) {
+                break;
+            }
+            const uint4 _e24 = psao_load_cell((entry * 2u));
+            if ((_e24.x == key)) {
+                return entry;
+            }
+        }
+    }
+    return 0u;
+}
+
 uint psao_naga_mod(uint lhs, uint rhs) {
     return lhs % (rhs == 0u ? 1u : rhs);
 }
 
 uint psao_find(PsaoGrid grid_2, uint3 cell_1)
 {
-    uint i = 0u;
-
-    const uint _e4 = psao_weigh(grid_2, cell_1, 1u, 1u);
-    const uint _e8 = psao_weigh(grid_2, cell_1, 17u, 31u);
-    uint bucket = (grid_2.bucket_first + psao_naga_mod(_e8, grid_2.bucket_count));
-    bool loop_init = true;
-    while(true) {
-        if (!loop_init) {
-            uint _e37 = i;
-            i = (_e37 + 1u);
-        }
-        loop_init = false;
-        uint _e14 = i;
-        if ((_e14 < 8u)) {
-        } else {
-            break;
-        }
-        {
-            uint _e19 = i;
-            const uint4 _e23 = psao_load_bucket(((bucket * 2u) + (_e19 >> 2u)));
-            uint _e24 = i;
-            uint entry = (_e23[(_e24 & 3u)] & PSAO_ENTRY_CELL);
-            if ((entry == 0u)) {
-                break;
-            }
-            const uint4 _e34 = psao_load_cell((entry * 2u));
-            if ((_e34.x == _e4)) {
-                return entry;
-            }
-        }
-    }
-    return 0u;
+    const uint _e5 = psao_weigh(grid_2, cell_1, 17u, 31u);
+    uint bucket_2 = (grid_2.bucket_first + psao_naga_mod(_e5, grid_2.bucket_count));
+    const uint _e11 = psao_weigh(grid_2, cell_1, 1u, 1u);
+    const uint _e12 = psao_search(bucket_2, _e11);
+    return _e12;
 }
 
 float3 psao_point_place(uint point_)
@@ -270,17 +317,17 @@ float psao_blend(bool planar, uint instance_2, float3 position_2, float3 normal_
             uint _e17 = corner;
             uint _e18 = corner;
             uint _e21 = corner;
-            uint3 offset_1 = (uint3(_e17, (_e18 >> 1u), (_e21 >> 2u)) & (1u).xxx);
-            uint3 cell_3 = (uint3(_e5.base) + offset_1);
-            if (any((cell_3 >= _e4.dims))) {
+            uint3 offset_4 = (uint3(_e17, (_e18 >> 1u), (_e21 >> 2u)) & (1u).xxx);
+            uint3 cell_4 = (uint3(_e5.base) + offset_4);
+            if (any((cell_4 >= _e4.dims))) {
                 continue;
             }
-            const uint _e34 = psao_find(_e4, cell_3);
+            const uint _e34 = psao_find(_e4, cell_4);
             if ((_e34 == 0u)) {
                 continue;
             }
-            float3 corner_from = (float3(offset_1) - _e5.place);
-            const float _e41 = psao_side(_e5.place, offset_1);
+            float3 corner_from = (float3(offset_4) - _e5.place);
+            const float _e41 = psao_side(_e5.place, offset_4);
             i_1 = 1u;
             bool loop_init_2 = true;
             while(true) {
@@ -349,9 +396,9 @@ float psao_paper(uint instance_4, float3 position_4, float3 normal_6)
     return _e4;
 }
 
-uint psao_tag(uint key)
+uint psao_tag(uint key_1)
 {
-    return max(((key * 2654435761u) >> 22u), 1u);
+    return max(((key_1 * 2654435761u) & 4290772992u), 4194304u);
 }
 
 uint psao_naga_f2u32(float value) {
@@ -366,247 +413,355 @@ uint psao_modulo(uint hash, uint count, float inverse)
     return ((raised >= count) ? (raised - count) : raised);
 }
 
-void psao_add(inout float2 sums, float inverse_radius2_, float3 normal_7, float3 place_1, float side, uint point_3)
+uint psao_lowest(uint bits)
 {
-    int3 steps_1 = int3(((point_3).xxx & uint3(2031616u, 65011712u, 2080374784u)));
-    float3 scale = float3(4.7683716e-7, 1.4901161e-8, 4.656613e-10);
-    float3 d_3 = ((float3(steps_1) * scale) - place_1);
-    int2 codes_1 = int2((uint2((point_3 >> 8u), (point_3 >> 12u)) & (15u).xx));
-    float2 uv_1 = (float2(min(codes_1, (int(14)).xx)) - (7.0).xx);
-    float z_1 = ((7.0 - abs(uv_1.x)) - abs(uv_1.y));
-    float fold = max(-(z_1), 0.0);
-    float3 m = float3((uv_1 - ((uv_1 < (0.0).xx) ? (-(fold)).xx : (fold).xx)), z_1);
-    float inverse_1 = (1.0 / dot(m, m));
-    float agree_1 = max(dot(m, normal_7), 0.0);
-    float agree2_1 = max(((agree_1 * agree_1) * inverse_1), 0.010000001);
-    float along_1 = dot(normal_7, d_3);
-    float point_along = dot(m, d_3);
-    float h2_ = max((along_1 * along_1), ((point_along * point_along) * inverse_1));
-    float apart_1 = (PSAO_CORE + ((dot(d_3, d_3) + (PSAO_FLATNESS * h2_)) * inverse_radius2_));
-    float openness = float(int((point_3 & 255u)));
-    float seen_1 = (min((openness * 0.019607844), 1.0) + PSAO_UNSEEN);
-    float agree4_1 = (agree2_1 * agree2_1);
-    float weight_1 = ((((side * seen_1) * agree4_1) * agree4_1) / (apart_1 * apart_1));
-    float2 _e94 = sums;
-    sums = (_e94 + (((point_3 >= 2147483648u) ? weight_1 : 0.0) * float2(1.0, openness)));
-    return;
+    return ((asuint(float(int((bits & (0u - bits))))) >> 23u) - 127u);
 }
 
-PsaoCandidate ConstructPsaoCandidate(uint arg0, bool arg1) {
+uint3 psao_corner(uint corner_1)
+{
+    return (uint3(corner_1, (corner_1 >> 1u), (corner_1 >> 2u)) & (1u).xxx);
+}
+
+PsaoGrid psao_grid_fast(uint instance_5)
+{
+    PsaoGrid grid_3 = (PsaoGrid)0;
+
+    const PsaoGrid _e1 = psao_grid(instance_5);
+    grid_3 = _e1;
+    float _e6 = grid_3.cells_per_unit.x;
+    float3 _e8 = grid_3.cells_per_unit;
+    grid_3.normal_scale = ((_e6).xxx / _e8);
+    PsaoGrid _e11 = grid_3;
+    const PsaoGrid psaogrid_1 = _e11;
+    return psaogrid_1;
+}
+
+PsaoTable ConstructPsaoTable(uint arg0, uint arg1, uint arg2, uint arg3, uint arg4, uint arg5, float arg6) {
+    PsaoTable ret = (PsaoTable)0;
+    ret.key = arg0;
+    ret.hash = arg1;
+    ret.row = arg2;
+    ret.layer = arg3;
+    ret.bucket_first = arg4;
+    ret.bucket_count = arg5;
+    ret.inverse_count = arg6;
+    return ret;
+}
+
+PsaoTable psao_table(PsaoGrid grid_4, uint3 base)
+{
+    uint row_1 = grid_4.dims.x;
+    uint layer = (grid_4.dims.x * grid_4.dims.y);
+    const PsaoTable psaotable = ConstructPsaoTable(((base.x + (base.y * row_1)) + (base.z * layer)), ((base.x + ((base.y * row_1) * 17u)) + ((base.z * layer) * 31u)), row_1, layer, grid_4.bucket_first, grid_4.bucket_count, (1.0 / float(grid_4.bucket_count)));
+    return psaotable;
+}
+
+uint psao_key(PsaoTable table, uint3 offset_1)
+{
+    return (((table.key + offset_1.x) + ((offset_1.y != 0u) ? table.row : 0u)) + ((offset_1.z != 0u) ? table.layer : 0u));
+}
+
+uint psao_bucket(PsaoTable table_1, uint3 offset_2)
+{
+    uint hash_1 = (((table_1.hash + offset_2.x) + ((offset_2.y != 0u) ? (table_1.row * 17u) : 0u)) + ((offset_2.z != 0u) ? (table_1.layer * 31u) : 0u));
+    const uint _e26 = psao_modulo(hash_1, table_1.bucket_count, table_1.inverse_count);
+    return (table_1.bucket_first + _e26);
+}
+
+uint psao_pick(uint4 entries, uint tag)
+{
+    uint4 rest_1 = (entries ^ (tag).xxxx);
+    return min(min(rest_1.x, rest_1.y), min(rest_1.z, rest_1.w));
+}
+
+PsaoCandidate ConstructPsaoCandidate(uint arg0, uint arg1) {
     PsaoCandidate ret = (PsaoCandidate)0;
     ret.cell = arg0;
     ret.unsure = arg1;
     return ret;
 }
 
-PsaoCandidate psao_pick(uint4 entries, uint tag)
-{
-    uint4 tags = (entries >> (22u).xxxx);
-    bool4 may = ((tags == (tag).xxxx) | (tags == (0u).xxxx));
-    uint4 cells = ((entries & (4194303u).xxxx) & ((0u).xxxx - uint4(may)));
-    uint sum_1 = (((cells.x + cells.y) + cells.z) + cells.w);
-    const PsaoCandidate psaocandidate = ConstructPsaoCandidate(sum_1, (sum_1 != max(max(cells.x, cells.y), max(cells.z, cells.w))));
-    return psaocandidate;
-}
-
-PsaoCandidate psao_candidate(PsaoGrid grid_3, float inverse_count, uint3 cell_2)
+PsaoCandidate psao_candidate(bool there, uint key_2, uint bucket_1)
 {
     bool local_4 = (bool)0;
     bool local_5 = (bool)0;
-    bool local_6 = (bool)0;
 
-    if (any((cell_2 >= grid_3.dims))) {
-        const PsaoCandidate psaocandidate_1 = ConstructPsaoCandidate(0u, false);
-        return psaocandidate_1;
+    if (!(there)) {
+        const PsaoCandidate psaocandidate = ConstructPsaoCandidate(0u, 0u);
+        return psaocandidate;
     }
-    const uint _e11 = psao_weigh(grid_3, cell_2, 1u, 1u);
-    const uint _e12 = psao_tag(_e11);
-    const uint _e15 = psao_weigh(grid_3, cell_2, 17u, 31u);
-    const uint _e18 = psao_modulo(_e15, grid_3.bucket_count, inverse_count);
-    uint bucket_1 = (grid_3.bucket_first + _e18);
-    const uint4 _e22 = psao_load_bucket((bucket_1 * 2u));
-    const PsaoCandidate _e23 = psao_pick(_e22, _e12);
-    if ((_e22.w == 0u)) {
-        const PsaoCandidate psaocandidate_2 = _e23;
-        return psaocandidate_2;
-    }
-    const uint4 _e31 = psao_load_bucket(((bucket_1 * 2u) + 1u));
-    const PsaoCandidate _e32 = psao_pick(_e31, _e12);
-    if ((_e23.cell != 0u)) {
-        local_4 = (_e32.cell != 0u);
+    const uint4 _e9 = psao_load_bucket((bucket_1 * 2u));
+    const uint _e10 = psao_tag(key_2);
+    const uint _e11 = psao_pick(_e9, _e10);
+    bool here = (_e11 <= PSAO_ENTRY_CELL);
+    if (!(here)) {
+        local_4 = (_e9.w != 0u);
     } else {
         local_4 = false;
     }
-    bool both = local_4;
-    if (!(_e23.unsure)) {
-        local_5 = _e32.unsure;
+    bool _e21 = local_4;
+    if (!(_e21)) {
+        local_5 = ((_e9.x - 1u) < PSAO_ENTRY_CELL);
     } else {
         local_5 = true;
     }
-    bool _e52 = local_5;
-    if (!(_e52)) {
-        local_6 = both;
-    } else {
-        local_6 = true;
-    }
-    bool _e57 = local_6;
-    const PsaoCandidate psaocandidate_3 = ConstructPsaoCandidate((_e23.cell + _e32.cell), _e57);
-    return psaocandidate_3;
+    bool unsure = local_5;
+    const PsaoCandidate psaocandidate_1 = ConstructPsaoCandidate((here ? _e11 : 0u), (unsure ? 1u : 0u));
+    return psaocandidate_1;
 }
 
-float psao_planar_fast(uint instance_5, float3 position_5, float3 normal_8)
+PsaoPair ConstructPsaoPair(uint2 arg0, uint arg1) {
+    PsaoPair ret = (PsaoPair)0;
+    ret.cells = arg0;
+    ret.unsure = arg1;
+    return ret;
+}
+
+PsaoPair psao_pair(PsaoTable table_2, bool2 there_1, uint2 row)
 {
+    uint3 offset_5 = uint3(0u, row);
+    const uint _e5 = psao_bucket(table_2, offset_5);
+    bool last = ((_e5 + 1u) == (table_2.bucket_first + table_2.bucket_count));
+    uint next = (last ? table_2.bucket_first : (_e5 + 1u));
+    const uint _e16 = psao_key(table_2, offset_5);
+    const PsaoCandidate _e18 = psao_candidate(there_1.x, _e16, _e5);
+    const PsaoCandidate _e22 = psao_candidate(there_1.y, (_e16 + 1u), next);
+    const PsaoPair psaopair = ConstructPsaoPair(uint2(_e18.cell, _e22.cell), (_e18.unsure | (_e22.unsure << 1u)));
+    return psaopair;
+}
+
+PsaoBlock ConstructPsaoBlock(uint4 arg0, uint4 arg1, uint arg2) {
+    PsaoBlock ret = (PsaoBlock)0;
+    ret.lower = arg0;
+    ret.upper = arg1;
+    ret.unsure = arg2;
+    return ret;
+}
+
+PsaoBlock psao_block(PsaoGrid grid_5, PsaoTable table_3, uint3 base_1, bool live)
+{
+    bool local_6 = (bool)0;
     bool local_7 = (bool)0;
     bool local_8 = (bool)0;
     bool local_9 = (bool)0;
+
+    bool3 low = ((base_1 < grid_5.dims) & (live).xxx);
+    bool3 high = (((base_1 + (1u).xxx) < grid_5.dims) & (live).xxx);
+    bool2 x = bool2(low.x, high.x);
+    if (low.y) {
+        local_6 = low.z;
+    } else {
+        local_6 = false;
+    }
+    bool _e23 = local_6;
+    const PsaoPair _e29 = psao_pair(table_3, (x & (_e23).xx), uint2(0u, 0u));
+    if (high.y) {
+        local_7 = low.z;
+    } else {
+        local_7 = false;
+    }
+    bool _e35 = local_7;
+    const PsaoPair _e41 = psao_pair(table_3, (x & (_e35).xx), uint2(1u, 0u));
+    if (low.y) {
+        local_8 = high.z;
+    } else {
+        local_8 = false;
+    }
+    bool _e47 = local_8;
+    const PsaoPair _e53 = psao_pair(table_3, (x & (_e47).xx), uint2(0u, 1u));
+    if (high.y) {
+        local_9 = high.z;
+    } else {
+        local_9 = false;
+    }
+    bool _e59 = local_9;
+    const PsaoPair _e65 = psao_pair(table_3, (x & (_e59).xx), uint2(1u, 1u));
+    const PsaoBlock psaoblock = ConstructPsaoBlock(uint4(_e29.cells, _e41.cells), uint4(_e53.cells, _e65.cells), (((_e29.unsure | (_e41.unsure << 2u)) | (_e53.unsure << 4u)) | (_e65.unsure << 6u)));
+    return psaoblock;
+}
+
+PsaoBlock psao_with(PsaoBlock block, uint corner_2, uint cell_2)
+{
+    bool4 here_1 = (uint4(0u, 1u, 2u, 3u) == ((corner_2 & 3u)).xxxx);
+    uint4 cells = (uint4(here_1) * cell_2);
+    uint4 high_1 = (((corner_2 >= 4u) ? 4294967295u : 0u)).xxxx;
+    const PsaoBlock psaoblock_1 = ConstructPsaoBlock((block.lower | (cells & ~(high_1))), (block.upper | (cells & high_1)), block.unsure);
+    return psaoblock_1;
+}
+
+uint psao_corners(PsaoBlock block_1)
+{
+    uint4 bits_1 = ((uint4((block_1.lower != (0u).xxxx)) * uint4(1u, 2u, 4u, 8u)) + (uint4((block_1.upper != (0u).xxxx)) * uint4(16u, 32u, 64u, 128u)));
+    return (((bits_1.x + bits_1.y) + bits_1.z) + bits_1.w);
+}
+
+uint psao_cell_at(PsaoBlock block_2, uint3 offset_3)
+{
+    bool back = (offset_3.y != 0u);
+    uint lower_1 = ((offset_3.x != 0u) ? (back ? block_2.lower.w : block_2.lower.y) : (back ? block_2.lower.z : block_2.lower.x));
+    uint upper = ((offset_3.x != 0u) ? (back ? block_2.upper.w : block_2.upper.y) : (back ? block_2.upper.z : block_2.upper.x));
+    return ((offset_3.z != 0u) ? upper : lower_1);
+}
+
+PsaoRound ConstructPsaoRound(uint3 arg0, bool arg1) {
+    PsaoRound ret = (PsaoRound)0;
+    ret.points = arg0;
+    ret.more = arg1;
+    return ret;
+}
+
+PsaoRound psao_round(uint cell_3, uint key_3, uint round_)
+{
     bool local_10 = (bool)0;
-    bool local_11 = (bool)0;
-    bool local_12 = (bool)0;
-    bool local_13 = (bool)0;
+
+    const uint4 _e8 = psao_load_cell(((cell_3 * 2u) + min(round_, 1u)));
+    uint first = ((round_ == 0u) ? ((_e8.x == key_3) ? _e8.y : 0u) : _e8.x);
+    uint a_1 = ((round_ == 2u) ? _e8.w : first);
+    if (!((a_1 == 0u))) {
+        local_10 = (round_ == 2u);
+    } else {
+        local_10 = true;
+    }
+    bool _e36 = local_10;
+    uint b_1 = (_e36 ? 0u : ((round_ == 0u) ? _e8.z : _e8.y));
+    uint c = ((b_1 == 0u) ? 0u : ((round_ == 0u) ? _e8.w : _e8.z));
+    const PsaoRound psaoround = ConstructPsaoRound(uint3(a_1, b_1, c), (c != 0u));
+    return psaoround;
+}
+
+float psao_share(float3 place_1)
+{
+    float3 sides_1 = clamp((((1.0).xxx - abs((place_1 - (0.5).xxx))) / (0.3).xxx), (0.0).xxx, (1.0).xxx);
+    return ((sides_1.x * sides_1.y) * sides_1.z);
+}
+
+PsaoPoint ConstructPsaoPoint(float3 arg0, float3 arg1, float arg2, float arg3, float arg4) {
+    PsaoPoint ret = (PsaoPoint)0;
+    ret.place = arg0;
+    ret.normal = arg1;
+    ret.square = arg2;
+    ret.openness = arg3;
+    ret.seen = arg4;
+    return ret;
+}
+
+PsaoPoint psao_point(uint point_3)
+{
+    int3 steps_1 = int3(((point_3).xxx & uint3(2031616u, 65011712u, 2080374784u)));
+    float3 scale = float3(4.7683716e-7, 1.4901161e-8, 4.656613e-10);
+    int2 codes_1 = int2((uint2((point_3 >> 8u), (point_3 >> 12u)) & (15u).xx));
+    float2 uv_1 = (float2(min(codes_1, (int(14)).xx)) - (7.0).xx);
+    float z_1 = ((7.0 - abs(uv_1.x)) - abs(uv_1.y));
+    float fold = max(-(z_1), 0.0);
+    float3 m = float3((uv_1 - ((uv_1 < (0.0).xx) ? (-(fold)).xx : (fold).xx)), z_1);
+    float openness = float(int((point_3 & 255u)));
+    float seen_1 = (min((openness * 0.019607844), 1.0) + PSAO_UNSEEN);
+    const PsaoPoint psaopoint = ConstructPsaoPoint((float3(steps_1) * scale), m, mad(m.x, m.x, mad(m.y, m.y, (m.z * m.z))), openness, ((int(point_3) >= int(0)) ? 0.0 : seen_1));
+    return psaopoint;
+}
+
+float psao_dot(float3 a, float3 b)
+{
+    return mad(a.x, b.x, mad(a.y, b.y, (a.z * b.z)));
+}
+
+float2 psao_add(float2 sums, float inverse_radius2_, float3 normal_7, float3 place_2, float share, uint word)
+{
+    const PsaoPoint _e6 = psao_point(word);
+    float3 d_3 = (_e6.place - place_2);
+    const float _e10 = psao_dot(_e6.normal, normal_7);
+    float agree_1 = max(_e10, 0.0);
+    float agree2_1 = max((agree_1 * agree_1), (0.010000001 * _e6.square));
+    const float _e18 = psao_dot(normal_7, d_3);
+    const float _e20 = psao_dot(_e6.normal, d_3);
+    float h2_ = max(((_e18 * _e18) * _e6.square), (_e20 * _e20));
+    const float _e26 = psao_dot(d_3, d_3);
+    float near = (mad(_e26, inverse_radius2_, PSAO_CORE) * _e6.square);
+    float apart_1 = mad(h2_, (PSAO_FLATNESS * inverse_radius2_), near);
+    float ratio = ((agree2_1 * agree2_1) / (apart_1 * _e6.square));
+    float weight_1 = ((share * _e6.seen) * (ratio * ratio));
+    return mad((weight_1).xx, float2(1.0, _e6.openness), sums);
+}
+
+float psao_planar_fast(uint instance_6, float3 position_5, float3 normal_8)
+{
+    PsaoBlock block_3 = (PsaoBlock)0;
     uint left = (uint)0;
     float2 sums_1 = (0.0).xx;
-    bool second = false;
-    uint4 words = (uint4)0;
-    bool local_14 = (bool)0;
-    bool local_15 = (bool)0;
-    bool local_16 = (bool)0;
+    uint round_1 = 0u;
 
-    const PsaoGrid _e3 = psao_grid(instance_5);
+    const PsaoGrid _e3 = psao_grid_fast(instance_6);
     const PsaoFragment _e4 = psao_fragment(_e3, position_5, normal_8);
     if (_e4.outside) {
         return 1.0;
     }
-    float inverse_count_1 = (1.0 / float(_e3.bucket_count));
-    uint3 base = uint3(_e4.base);
-    const PsaoCandidate _e13 = psao_candidate(_e3, inverse_count_1, base);
-    const PsaoCandidate _e19 = psao_candidate(_e3, inverse_count_1, (base + uint3(1u, 0u, 0u)));
-    const PsaoCandidate _e25 = psao_candidate(_e3, inverse_count_1, (base + uint3(0u, 1u, 0u)));
-    const PsaoCandidate _e31 = psao_candidate(_e3, inverse_count_1, (base + uint3(1u, 1u, 0u)));
-    const PsaoCandidate _e37 = psao_candidate(_e3, inverse_count_1, (base + uint3(0u, 0u, 1u)));
-    const PsaoCandidate _e43 = psao_candidate(_e3, inverse_count_1, (base + uint3(1u, 0u, 1u)));
-    const PsaoCandidate _e49 = psao_candidate(_e3, inverse_count_1, (base + uint3(0u, 1u, 1u)));
-    const PsaoCandidate _e55 = psao_candidate(_e3, inverse_count_1, (base + uint3(1u, 1u, 1u)));
-    if (!(_e13.unsure)) {
-        local_7 = _e19.unsure;
-    } else {
-        local_7 = true;
-    }
-    bool _e62 = local_7;
-    if (!(_e62)) {
-        local_8 = _e25.unsure;
-    } else {
-        local_8 = true;
-    }
-    bool _e68 = local_8;
-    if (!(_e68)) {
-        local_9 = _e31.unsure;
-    } else {
-        local_9 = true;
-    }
-    bool _e74 = local_9;
-    if (!(_e74)) {
-        local_10 = _e37.unsure;
-    } else {
-        local_10 = true;
-    }
-    bool _e80 = local_10;
-    if (!(_e80)) {
-        local_11 = _e43.unsure;
-    } else {
-        local_11 = true;
-    }
-    bool _e86 = local_11;
-    if (!(_e86)) {
-        local_12 = _e49.unsure;
-    } else {
-        local_12 = true;
-    }
-    bool _e92 = local_12;
-    if (!(_e92)) {
-        local_13 = _e55.unsure;
-    } else {
-        local_13 = true;
-    }
-    bool _e98 = local_13;
-    if (_e98) {
-        const float _e99 = psao_planar(instance_5, position_5, normal_8);
-        return _e99;
-    }
-    left = (((((((((_e13.cell != 0u) ? 1u : 0u) | ((_e19.cell != 0u) ? 2u : 0u)) | ((_e25.cell != 0u) ? 4u : 0u)) | ((_e31.cell != 0u) ? 8u : 0u)) | ((_e37.cell != 0u) ? 16u : 0u)) | ((_e43.cell != 0u) ? 32u : 0u)) | ((_e49.cell != 0u) ? 64u : 0u)) | ((_e55.cell != 0u) ? 128u : 0u));
-    float inverse_radius2_1 = (1.0 / (_e3.radius * _e3.radius));
+    uint3 base_2 = uint3(_e4.base);
+    const PsaoTable _e9 = psao_table(_e3, base_2);
+    const PsaoBlock _e11 = psao_block(_e3, _e9, base_2, true);
+    block_3 = _e11;
     while(true) {
-        uint _e166 = left;
-        if ((_e166 != 0u)) {
+        uint _e14 = block_3.unsure;
+        if ((_e14 != 0u)) {
         } else {
             break;
         }
         {
-            uint _e169 = left;
-            uint _e171 = left;
-            uint corner_1 = ((asuint(float(int((_e169 & (0u - _e171))))) >> 23u) - 127u);
-            uint3 offset_2 = (uint3(corner_1, (corner_1 >> 1u), (corner_1 >> 2u)) & (1u).xxx);
-            bool right = (offset_2.x != 0u);
-            bool back = (offset_2.y != 0u);
-            uint lower_1 = (back ? (right ? _e31.cell : _e25.cell) : (right ? _e19.cell : _e13.cell));
-            uint upper = (back ? (right ? _e55.cell : _e49.cell) : (right ? _e43.cell : _e37.cell));
-            uint found = ((offset_2.z != 0u) ? upper : lower_1);
-            bool _e217 = second;
-            const uint4 _e220 = psao_load_cell(((found * 2u) + (_e217 ? 1u : 0u)));
-            words = _e220;
-            bool _e222 = second;
-            if (!(_e222)) {
-                uint _e227 = words.x;
-                const uint _e231 = psao_weigh(_e3, (base + offset_2), 1u, 1u);
-                local_14 = (_e227 != _e231);
-            } else {
-                local_14 = false;
-            }
-            bool _e234 = local_14;
-            if (_e234) {
-                words = (0u).xxxx;
-            }
-            uint _e239 = words.x;
-            bool _e240 = second;
-            uint a = (_e240 ? _e239 : 0u);
-            uint _e243 = words.y;
-            bool _e245 = second;
-            if (_e245) {
-                local_15 = (a == 0u);
-            } else {
-                local_15 = false;
-            }
-            bool _e251 = local_15;
-            uint b = (_e251 ? 0u : _e243);
-            uint _e255 = words.z;
-            uint c = ((b != 0u) ? _e255 : 0u);
-            uint _e261 = words.w;
-            uint d_4 = ((c != 0u) ? _e261 : 0u);
-            const float _e266 = psao_side(_e4.place, offset_2);
-            float3 place_2 = ((_e4.place - (0.015625).xxx) - float3(int3(offset_2)));
-            bool _e274 = second;
-            if (_e274) {
-                psao_add(sums_1, inverse_radius2_1, _e4.normal, place_2, _e266, a);
-            }
-            psao_add(sums_1, inverse_radius2_1, _e4.normal, place_2, _e266, b);
-            psao_add(sums_1, inverse_radius2_1, _e4.normal, place_2, _e266, c);
-            psao_add(sums_1, inverse_radius2_1, _e4.normal, place_2, _e266, d_4);
-            bool _e279 = second;
-            if (!(_e279)) {
-                local_16 = (d_4 != 0u);
-            } else {
-                local_16 = false;
-            }
-            bool _e286 = local_16;
-            second = _e286;
-            uint _e287 = left;
-            uint _e288 = left;
-            uint _e292 = left;
-            bool _e293 = second;
-            left = (_e293 ? _e292 : (_e287 & (_e288 - 1u)));
+            uint _e18 = block_3.unsure;
+            const uint _e19 = psao_lowest(_e18);
+            const uint3 _e20 = psao_corner(_e19);
+            const uint _e21 = psao_bucket(_e9, _e20);
+            const uint _e22 = psao_key(_e9, _e20);
+            const uint _e23 = psao_search(_e21, _e22);
+            PsaoBlock _e24 = block_3;
+            const PsaoBlock _e25 = psao_with(_e24, _e19, _e23);
+            block_3 = _e25;
+            uint _e27 = block_3.unsure;
+            uint _e29 = block_3.unsure;
+            block_3.unsure = (_e27 & (_e29 - 1u));
         }
     }
-    float _e296 = sums_1.y;
-    float _e298 = sums_1.x;
-    float _e305 = sums_1.x;
-    return ((_e305 > 0.0) ? min(((_e296 / _e298) * 0.003921569), 1.0) : 1.0);
+    PsaoBlock _e33 = block_3;
+    const uint _e34 = psao_corners(_e33);
+    left = _e34;
+    float inverse_radius2_1 = (1.0 / (_e3.radius * _e3.radius));
+    while(true) {
+        uint _e46 = left;
+        if ((_e46 != 0u)) {
+        } else {
+            break;
+        }
+        {
+            uint _e49 = left;
+            const uint _e50 = psao_lowest(_e49);
+            const uint3 _e51 = psao_corner(_e50);
+            PsaoBlock _e52 = block_3;
+            const uint _e53 = psao_cell_at(_e52, _e51);
+            const uint _e54 = psao_key(_e9, _e51);
+            uint _e55 = round_1;
+            const PsaoRound _e56 = psao_round(_e53, _e54, _e55);
+            float3 at = (_e4.place - float3(int3(_e51)));
+            const float _e61 = psao_share(at);
+            float3 place_3 = (at - (0.015625).xxx);
+            float2 _e65 = sums_1;
+            const float2 _e69 = psao_add(_e65, inverse_radius2_1, _e4.normal, place_3, _e61, _e56.points.x);
+            sums_1 = _e69;
+            float2 _e70 = sums_1;
+            const float2 _e74 = psao_add(_e70, inverse_radius2_1, _e4.normal, place_3, _e61, _e56.points.y);
+            sums_1 = _e74;
+            float2 _e75 = sums_1;
+            const float2 _e79 = psao_add(_e75, inverse_radius2_1, _e4.normal, place_3, _e61, _e56.points.z);
+            sums_1 = _e79;
+            uint _e81 = round_1;
+            round_1 = (_e56.more ? (_e81 + 1u) : 0u);
+            uint _e86 = left;
+            uint _e87 = left;
+            uint _e91 = left;
+            left = (_e56.more ? _e91 : (_e86 & (_e87 - 1u)));
+        }
+    }
+    float _e95 = sums_1.y;
+    float _e97 = sums_1.x;
+    float _e104 = sums_1.x;
+    return ((_e104 > 0.0) ? min(((_e95 / _e97) * 0.003921569), 1.0) : 1.0);
 }

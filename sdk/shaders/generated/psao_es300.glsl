@@ -38,9 +38,38 @@ struct PsaoFragment {
     vec3 normal;
     bool outside;
 };
+struct PsaoTable {
+    uint key;
+    uint hash;
+    uint row;
+    uint layer;
+    uint bucket_first;
+    uint bucket_count;
+    float inverse_count;
+};
 struct PsaoCandidate {
     uint cell;
-    bool unsure;
+    uint unsure;
+};
+struct PsaoPair {
+    uvec2 cells;
+    uint unsure;
+};
+struct PsaoBlock {
+    uvec4 lower;
+    uvec4 upper;
+    uint unsure;
+};
+struct PsaoRound {
+    uvec3 points;
+    bool more;
+};
+struct PsaoPoint {
+    vec3 place;
+    vec3 normal;
+    float square;
+    float openness;
+    float seen;
 };
 const float PSAO_T_N = 0.1;
 const float PSAO_T_D = 0.7;
@@ -114,38 +143,43 @@ uint psao_weigh(PsaoGrid grid_1, uvec3 cell, uint weight_y, uint weight_z) {
     return ((cell.x + ((cell.y * grid_1.dims.x) * weight_y)) + ((cell.z * (grid_1.dims.x * grid_1.dims.y)) * weight_z));
 }
 
-uint psao_find(PsaoGrid grid_2, uvec3 cell_1) {
+uint psao_search(uint bucket, uint key) {
     uint i = 0u;
-    uint _e4 = psao_weigh(grid_2, cell_1, 1u, 1u);
-    uint _e8 = psao_weigh(grid_2, cell_1, 17u, 31u);
-    uint bucket = (grid_2.bucket_first + (_e8 % grid_2.bucket_count));
     bool loop_init = true;
     while(true) {
         if (!loop_init) {
-            uint _e37 = i;
-            i = (_e37 + 1u);
+            uint _e27 = i;
+            i = (_e27 + 1u);
         }
         loop_init = false;
-        uint _e14 = i;
-        if ((_e14 < 8u)) {
+        uint _e4 = i;
+        if ((_e4 < 8u)) {
         } else {
             break;
         }
         {
-            uint _e19 = i;
-            uvec4 _e23 = psao_load_bucket(((bucket * 2u) + (_e19 >> 2u)));
-            uint _e24 = i;
-            uint entry = (_e23[(_e24 & 3u)] & PSAO_ENTRY_CELL);
+            uint _e9 = i;
+            uvec4 _e13 = psao_load_bucket(((bucket * 2u) + (_e9 >> 2u)));
+            uint _e14 = i;
+            uint entry = (_e13[(_e14 & 3u)] & PSAO_ENTRY_CELL);
             if ((entry == 0u)) {
                 break;
             }
-            uvec4 _e34 = psao_load_cell((entry * 2u));
-            if ((_e34.x == _e4)) {
+            uvec4 _e24 = psao_load_cell((entry * 2u));
+            if ((_e24.x == key)) {
                 return entry;
             }
         }
     }
     return 0u;
+}
+
+uint psao_find(PsaoGrid grid_2, uvec3 cell_1) {
+    uint _e5 = psao_weigh(grid_2, cell_1, 17u, 31u);
+    uint bucket_2 = (grid_2.bucket_first + (_e5 % grid_2.bucket_count));
+    uint _e11 = psao_weigh(grid_2, cell_1, 1u, 1u);
+    uint _e12 = psao_search(bucket_2, _e11);
+    return _e12;
 }
 
 vec3 psao_point_place(uint point) {
@@ -230,17 +264,17 @@ float psao_blend(bool planar, uint instance_2, vec3 position_2, vec3 normal_4) {
             uint _e17 = corner;
             uint _e18 = corner;
             uint _e21 = corner;
-            uvec3 offset_1 = (uvec3(_e17, (_e18 >> 1u), (_e21 >> 2u)) & uvec3(1u));
-            uvec3 cell_3 = (uvec3(_e5.base) + offset_1);
-            if (any(greaterThanEqual(cell_3, _e4.dims))) {
+            uvec3 offset_4 = (uvec3(_e17, (_e18 >> 1u), (_e21 >> 2u)) & uvec3(1u));
+            uvec3 cell_4 = (uvec3(_e5.base) + offset_4);
+            if (any(greaterThanEqual(cell_4, _e4.dims))) {
                 continue;
             }
-            uint _e34 = psao_find(_e4, cell_3);
+            uint _e34 = psao_find(_e4, cell_4);
             if ((_e34 == 0u)) {
                 continue;
             }
-            vec3 corner_from = (vec3(offset_1) - _e5.place);
-            float _e41 = psao_side(_e5.place, offset_1);
+            vec3 corner_from = (vec3(offset_4) - _e5.place);
+            float _e41 = psao_side(_e5.place, offset_4);
             i_1 = 1u;
             bool loop_init_2 = true;
             while(true) {
@@ -307,8 +341,8 @@ float psao_paper(uint instance_4, vec3 position_4, vec3 normal_6) {
     return _e4;
 }
 
-uint psao_tag(uint key) {
-    return max(((key * 2654435761u) >> 22u), 1u);
+uint psao_tag(uint key_1) {
+    return max(((key_1 * 2654435761u) & 4290772992u), 4194304u);
 }
 
 uint psao_modulo(uint hash, uint count, float inverse_) {
@@ -318,230 +352,271 @@ uint psao_modulo(uint hash, uint count, float inverse_) {
     return ((raised >= count) ? (raised - count) : raised);
 }
 
-void psao_add(inout vec2 sums, float inverse_radius2_, vec3 normal_7, vec3 place_1, float side, uint point_3) {
+uint psao_lowest(uint bits) {
+    return ((floatBitsToUint(float(int((bits & (0u - bits))))) >> 23u) - 127u);
+}
+
+uvec3 psao_corner(uint corner_1) {
+    return (uvec3(corner_1, (corner_1 >> 1u), (corner_1 >> 2u)) & uvec3(1u));
+}
+
+PsaoGrid psao_grid_fast(uint instance_5) {
+    PsaoGrid grid_3 = PsaoGrid(vec3(0.0), 0.0, vec3(0.0), 0u, uvec3(0u), 0u, vec3(0.0));
+    PsaoGrid _e1 = psao_grid(instance_5);
+    grid_3 = _e1;
+    float _e6 = grid_3.cells_per_unit.x;
+    vec3 _e8 = grid_3.cells_per_unit;
+    grid_3.normal_scale = (vec3(_e6) / _e8);
+    PsaoGrid _e11 = grid_3;
+    return _e11;
+}
+
+PsaoTable psao_table(PsaoGrid grid_4, uvec3 base) {
+    uint row_1 = grid_4.dims.x;
+    uint layer = (grid_4.dims.x * grid_4.dims.y);
+    return PsaoTable(((base.x + (base.y * row_1)) + (base.z * layer)), ((base.x + ((base.y * row_1) * 17u)) + ((base.z * layer) * 31u)), row_1, layer, grid_4.bucket_first, grid_4.bucket_count, (1.0 / float(grid_4.bucket_count)));
+}
+
+uint psao_key(PsaoTable table, uvec3 offset_1) {
+    return (((table.key + offset_1.x) + ((offset_1.y != 0u) ? table.row : 0u)) + ((offset_1.z != 0u) ? table.layer : 0u));
+}
+
+uint psao_bucket(PsaoTable table_1, uvec3 offset_2) {
+    uint hash_1 = (((table_1.hash + offset_2.x) + ((offset_2.y != 0u) ? (table_1.row * 17u) : 0u)) + ((offset_2.z != 0u) ? (table_1.layer * 31u) : 0u));
+    uint _e26 = psao_modulo(hash_1, table_1.bucket_count, table_1.inverse_count);
+    return (table_1.bucket_first + _e26);
+}
+
+uint psao_pick(uvec4 entries, uint tag) {
+    uvec4 rest_1 = (entries ^ uvec4(tag));
+    return min(min(rest_1.x, rest_1.y), min(rest_1.z, rest_1.w));
+}
+
+PsaoCandidate psao_candidate(bool there, uint key_2, uint bucket_1) {
+    bool local_4 = false;
+    bool local_5 = false;
+    if (!(there)) {
+        return PsaoCandidate(0u, 0u);
+    }
+    uvec4 _e9 = psao_load_bucket((bucket_1 * 2u));
+    uint _e10 = psao_tag(key_2);
+    uint _e11 = psao_pick(_e9, _e10);
+    bool here = (_e11 <= PSAO_ENTRY_CELL);
+    if (!(here)) {
+        local_4 = (_e9.w != 0u);
+    } else {
+        local_4 = false;
+    }
+    bool _e21 = local_4;
+    if (!(_e21)) {
+        local_5 = ((_e9.x - 1u) < PSAO_ENTRY_CELL);
+    } else {
+        local_5 = true;
+    }
+    bool unsure = local_5;
+    return PsaoCandidate((here ? _e11 : 0u), (unsure ? 1u : 0u));
+}
+
+PsaoPair psao_pair(PsaoTable table_2, bvec2 there_1, uvec2 row) {
+    uvec3 offset_5 = uvec3(0u, row);
+    uint _e5 = psao_bucket(table_2, offset_5);
+    bool last = ((_e5 + 1u) == (table_2.bucket_first + table_2.bucket_count));
+    uint next = (last ? table_2.bucket_first : (_e5 + 1u));
+    uint _e16 = psao_key(table_2, offset_5);
+    PsaoCandidate _e18 = psao_candidate(there_1.x, _e16, _e5);
+    PsaoCandidate _e22 = psao_candidate(there_1.y, (_e16 + 1u), next);
+    return PsaoPair(uvec2(_e18.cell, _e22.cell), (_e18.unsure | (_e22.unsure << 1u)));
+}
+
+PsaoBlock psao_block(PsaoGrid grid_5, PsaoTable table_3, uvec3 base_1, bool live) {
+    bool local_6 = false;
+    bool local_7 = false;
+    bool local_8 = false;
+    bool local_9 = false;
+    bvec3 low = bvec3(lessThan(base_1, grid_5.dims).x && bvec3(live).x, lessThan(base_1, grid_5.dims).y && bvec3(live).y, lessThan(base_1, grid_5.dims).z && bvec3(live).z);
+    bvec3 high = bvec3(lessThan((base_1 + uvec3(1u)), grid_5.dims).x && bvec3(live).x, lessThan((base_1 + uvec3(1u)), grid_5.dims).y && bvec3(live).y, lessThan((base_1 + uvec3(1u)), grid_5.dims).z && bvec3(live).z);
+    bvec2 x = bvec2(low.x, high.x);
+    if (low.y) {
+        local_6 = low.z;
+    } else {
+        local_6 = false;
+    }
+    bool _e23 = local_6;
+    PsaoPair _e29 = psao_pair(table_3, bvec2(x.x && bvec2(_e23).x, x.y && bvec2(_e23).y), uvec2(0u, 0u));
+    if (high.y) {
+        local_7 = low.z;
+    } else {
+        local_7 = false;
+    }
+    bool _e35 = local_7;
+    PsaoPair _e41 = psao_pair(table_3, bvec2(x.x && bvec2(_e35).x, x.y && bvec2(_e35).y), uvec2(1u, 0u));
+    if (low.y) {
+        local_8 = high.z;
+    } else {
+        local_8 = false;
+    }
+    bool _e47 = local_8;
+    PsaoPair _e53 = psao_pair(table_3, bvec2(x.x && bvec2(_e47).x, x.y && bvec2(_e47).y), uvec2(0u, 1u));
+    if (high.y) {
+        local_9 = high.z;
+    } else {
+        local_9 = false;
+    }
+    bool _e59 = local_9;
+    PsaoPair _e65 = psao_pair(table_3, bvec2(x.x && bvec2(_e59).x, x.y && bvec2(_e59).y), uvec2(1u, 1u));
+    return PsaoBlock(uvec4(_e29.cells, _e41.cells), uvec4(_e53.cells, _e65.cells), (((_e29.unsure | (_e41.unsure << 2u)) | (_e53.unsure << 4u)) | (_e65.unsure << 6u)));
+}
+
+PsaoBlock psao_with(PsaoBlock block, uint corner_2, uint cell_2) {
+    bvec4 here_1 = equal(uvec4(0u, 1u, 2u, 3u), uvec4((corner_2 & 3u)));
+    uvec4 cells = (uvec4(here_1) * cell_2);
+    uvec4 high_1 = uvec4(((corner_2 >= 4u) ? 4294967295u : 0u));
+    return PsaoBlock((block.lower | (cells & ~(high_1))), (block.upper | (cells & high_1)), block.unsure);
+}
+
+uint psao_corners(PsaoBlock block_1) {
+    uvec4 bits_1 = ((uvec4(notEqual(block_1.lower, uvec4(0u))) * uvec4(1u, 2u, 4u, 8u)) + (uvec4(notEqual(block_1.upper, uvec4(0u))) * uvec4(16u, 32u, 64u, 128u)));
+    return (((bits_1.x + bits_1.y) + bits_1.z) + bits_1.w);
+}
+
+uint psao_cell_at(PsaoBlock block_2, uvec3 offset_3) {
+    bool back = (offset_3.y != 0u);
+    uint lower_1 = ((offset_3.x != 0u) ? (back ? block_2.lower.w : block_2.lower.y) : (back ? block_2.lower.z : block_2.lower.x));
+    uint upper = ((offset_3.x != 0u) ? (back ? block_2.upper.w : block_2.upper.y) : (back ? block_2.upper.z : block_2.upper.x));
+    return ((offset_3.z != 0u) ? upper : lower_1);
+}
+
+PsaoRound psao_round(uint cell_3, uint key_3, uint round_) {
+    bool local_10 = false;
+    uvec4 _e8 = psao_load_cell(((cell_3 * 2u) + min(round_, 1u)));
+    uint first = ((round_ == 0u) ? ((_e8.x == key_3) ? _e8.y : 0u) : _e8.x);
+    uint a_1 = ((round_ == 2u) ? _e8.w : first);
+    if (!((a_1 == 0u))) {
+        local_10 = (round_ == 2u);
+    } else {
+        local_10 = true;
+    }
+    bool _e36 = local_10;
+    uint b_1 = (_e36 ? 0u : ((round_ == 0u) ? _e8.z : _e8.y));
+    uint c = ((b_1 == 0u) ? 0u : ((round_ == 0u) ? _e8.w : _e8.z));
+    return PsaoRound(uvec3(a_1, b_1, c), (c != 0u));
+}
+
+float psao_share(vec3 place_1) {
+    vec3 sides_1 = clamp(((vec3(1.0) - abs((place_1 - vec3(0.5)))) / vec3(0.3)), vec3(0.0), vec3(1.0));
+    return ((sides_1.x * sides_1.y) * sides_1.z);
+}
+
+PsaoPoint psao_point(uint point_3) {
     ivec3 steps_1 = ivec3((uvec3(point_3) & uvec3(2031616u, 65011712u, 2080374784u)));
     vec3 scale = vec3(4.7683716e-7, 1.4901161e-8, 4.656613e-10);
-    vec3 d_3 = ((vec3(steps_1) * scale) - place_1);
     ivec2 codes_1 = ivec2((uvec2((point_3 >> 8u), (point_3 >> 12u)) & uvec2(15u)));
     vec2 uv_1 = (vec2(min(codes_1, ivec2(14))) - vec2(7.0));
     float z_1 = ((7.0 - abs(uv_1.x)) - abs(uv_1.y));
     float fold = max(-(z_1), 0.0);
     vec3 m = vec3((uv_1 - mix(vec2(fold), vec2(-(fold)), lessThan(uv_1, vec2(0.0)))), z_1);
-    float inverse_1 = (1.0 / dot(m, m));
-    float agree_1 = max(dot(m, normal_7), 0.0);
-    float agree2_1 = max(((agree_1 * agree_1) * inverse_1), 0.010000001);
-    float along_1 = dot(normal_7, d_3);
-    float point_along = dot(m, d_3);
-    float h2_ = max((along_1 * along_1), ((point_along * point_along) * inverse_1));
-    float apart_1 = (PSAO_CORE + ((dot(d_3, d_3) + (PSAO_FLATNESS * h2_)) * inverse_radius2_));
     float openness = float(int((point_3 & 255u)));
     float seen_1 = (min((openness * 0.019607844), 1.0) + PSAO_UNSEEN);
-    float agree4_1 = (agree2_1 * agree2_1);
-    float weight_1 = ((((side * seen_1) * agree4_1) * agree4_1) / (apart_1 * apart_1));
-    vec2 _e94 = sums;
-    sums = (_e94 + (((point_3 >= 2147483648u) ? weight_1 : 0.0) * vec2(1.0, openness)));
-    return;
+    return PsaoPoint((vec3(steps_1) * scale), m, (m.x * m.x + (m.y * m.y + (m.z * m.z))), openness, ((int(point_3) >= 0) ? 0.0 : seen_1));
 }
 
-PsaoCandidate psao_pick(uvec4 entries, uint tag) {
-    uvec4 tags = (entries >> uvec4(22u));
-    bvec4 may = bvec4(equal(tags, uvec4(tag)).x || equal(tags, uvec4(0u)).x, equal(tags, uvec4(tag)).y || equal(tags, uvec4(0u)).y, equal(tags, uvec4(tag)).z || equal(tags, uvec4(0u)).z, equal(tags, uvec4(tag)).w || equal(tags, uvec4(0u)).w);
-    uvec4 cells = ((entries & uvec4(4194303u)) & (uvec4(0u) - uvec4(may)));
-    uint sum_1 = (((cells.x + cells.y) + cells.z) + cells.w);
-    return PsaoCandidate(sum_1, (sum_1 != max(max(cells.x, cells.y), max(cells.z, cells.w))));
+float psao_dot(vec3 a, vec3 b) {
+    return (a.x * b.x + (a.y * b.y + (a.z * b.z)));
 }
 
-PsaoCandidate psao_candidate(PsaoGrid grid_3, float inverse_count, uvec3 cell_2) {
-    bool local_4 = false;
-    bool local_5 = false;
-    bool local_6 = false;
-    if (any(greaterThanEqual(cell_2, grid_3.dims))) {
-        return PsaoCandidate(0u, false);
-    }
-    uint _e11 = psao_weigh(grid_3, cell_2, 1u, 1u);
-    uint _e12 = psao_tag(_e11);
-    uint _e15 = psao_weigh(grid_3, cell_2, 17u, 31u);
-    uint _e18 = psao_modulo(_e15, grid_3.bucket_count, inverse_count);
-    uint bucket_1 = (grid_3.bucket_first + _e18);
-    uvec4 _e22 = psao_load_bucket((bucket_1 * 2u));
-    PsaoCandidate _e23 = psao_pick(_e22, _e12);
-    if ((_e22.w == 0u)) {
-        return _e23;
-    }
-    uvec4 _e31 = psao_load_bucket(((bucket_1 * 2u) + 1u));
-    PsaoCandidate _e32 = psao_pick(_e31, _e12);
-    if ((_e23.cell != 0u)) {
-        local_4 = (_e32.cell != 0u);
-    } else {
-        local_4 = false;
-    }
-    bool both = local_4;
-    if (!(_e23.unsure)) {
-        local_5 = _e32.unsure;
-    } else {
-        local_5 = true;
-    }
-    bool _e52 = local_5;
-    if (!(_e52)) {
-        local_6 = both;
-    } else {
-        local_6 = true;
-    }
-    bool _e57 = local_6;
-    return PsaoCandidate((_e23.cell + _e32.cell), _e57);
+vec2 psao_add(vec2 sums, float inverse_radius2_, vec3 normal_7, vec3 place_2, float share, uint word) {
+    PsaoPoint _e6 = psao_point(word);
+    vec3 d_3 = (_e6.place - place_2);
+    float _e10 = psao_dot(_e6.normal, normal_7);
+    float agree_1 = max(_e10, 0.0);
+    float agree2_1 = max((agree_1 * agree_1), (0.010000001 * _e6.square));
+    float _e18 = psao_dot(normal_7, d_3);
+    float _e20 = psao_dot(_e6.normal, d_3);
+    float h2_ = max(((_e18 * _e18) * _e6.square), (_e20 * _e20));
+    float _e26 = psao_dot(d_3, d_3);
+    float near = ((_e26 * inverse_radius2_ + PSAO_CORE) * _e6.square);
+    float apart_1 = (h2_ * (PSAO_FLATNESS * inverse_radius2_) + near);
+    float ratio = ((agree2_1 * agree2_1) / (apart_1 * _e6.square));
+    float weight_1 = ((share * _e6.seen) * (ratio * ratio));
+    return (vec2(weight_1) * vec2(1.0, _e6.openness) + sums);
 }
 
-float psao_planar_fast(uint instance_5, vec3 position_5, vec3 normal_8) {
-    bool local_7 = false;
-    bool local_8 = false;
-    bool local_9 = false;
-    bool local_10 = false;
-    bool local_11 = false;
-    bool local_12 = false;
-    bool local_13 = false;
+float psao_planar_fast(uint instance_6, vec3 position_5, vec3 normal_8) {
+    PsaoBlock block_3 = PsaoBlock(uvec4(0u), uvec4(0u), 0u);
     uint left = 0u;
     vec2 sums_1 = vec2(0.0);
-    bool second = false;
-    uvec4 words = uvec4(0u);
-    bool local_14 = false;
-    bool local_15 = false;
-    bool local_16 = false;
-    PsaoGrid _e3 = psao_grid(instance_5);
+    uint round_1 = 0u;
+    PsaoGrid _e3 = psao_grid_fast(instance_6);
     PsaoFragment _e4 = psao_fragment(_e3, position_5, normal_8);
     if (_e4.outside) {
         return 1.0;
     }
-    float inverse_count_1 = (1.0 / float(_e3.bucket_count));
-    uvec3 base = uvec3(_e4.base);
-    PsaoCandidate _e13 = psao_candidate(_e3, inverse_count_1, base);
-    PsaoCandidate _e19 = psao_candidate(_e3, inverse_count_1, (base + uvec3(1u, 0u, 0u)));
-    PsaoCandidate _e25 = psao_candidate(_e3, inverse_count_1, (base + uvec3(0u, 1u, 0u)));
-    PsaoCandidate _e31 = psao_candidate(_e3, inverse_count_1, (base + uvec3(1u, 1u, 0u)));
-    PsaoCandidate _e37 = psao_candidate(_e3, inverse_count_1, (base + uvec3(0u, 0u, 1u)));
-    PsaoCandidate _e43 = psao_candidate(_e3, inverse_count_1, (base + uvec3(1u, 0u, 1u)));
-    PsaoCandidate _e49 = psao_candidate(_e3, inverse_count_1, (base + uvec3(0u, 1u, 1u)));
-    PsaoCandidate _e55 = psao_candidate(_e3, inverse_count_1, (base + uvec3(1u, 1u, 1u)));
-    if (!(_e13.unsure)) {
-        local_7 = _e19.unsure;
-    } else {
-        local_7 = true;
-    }
-    bool _e62 = local_7;
-    if (!(_e62)) {
-        local_8 = _e25.unsure;
-    } else {
-        local_8 = true;
-    }
-    bool _e68 = local_8;
-    if (!(_e68)) {
-        local_9 = _e31.unsure;
-    } else {
-        local_9 = true;
-    }
-    bool _e74 = local_9;
-    if (!(_e74)) {
-        local_10 = _e37.unsure;
-    } else {
-        local_10 = true;
-    }
-    bool _e80 = local_10;
-    if (!(_e80)) {
-        local_11 = _e43.unsure;
-    } else {
-        local_11 = true;
-    }
-    bool _e86 = local_11;
-    if (!(_e86)) {
-        local_12 = _e49.unsure;
-    } else {
-        local_12 = true;
-    }
-    bool _e92 = local_12;
-    if (!(_e92)) {
-        local_13 = _e55.unsure;
-    } else {
-        local_13 = true;
-    }
-    bool _e98 = local_13;
-    if (_e98) {
-        float _e99 = psao_planar(instance_5, position_5, normal_8);
-        return _e99;
-    }
-    left = (((((((((_e13.cell != 0u) ? 1u : 0u) | ((_e19.cell != 0u) ? 2u : 0u)) | ((_e25.cell != 0u) ? 4u : 0u)) | ((_e31.cell != 0u) ? 8u : 0u)) | ((_e37.cell != 0u) ? 16u : 0u)) | ((_e43.cell != 0u) ? 32u : 0u)) | ((_e49.cell != 0u) ? 64u : 0u)) | ((_e55.cell != 0u) ? 128u : 0u));
-    float inverse_radius2_1 = (1.0 / (_e3.radius * _e3.radius));
+    uvec3 base_2 = uvec3(_e4.base);
+    PsaoTable _e9 = psao_table(_e3, base_2);
+    PsaoBlock _e11 = psao_block(_e3, _e9, base_2, true);
+    block_3 = _e11;
     while(true) {
-        uint _e166 = left;
-        if ((_e166 != 0u)) {
+        uint _e14 = block_3.unsure;
+        if ((_e14 != 0u)) {
         } else {
             break;
         }
         {
-            uint _e169 = left;
-            uint _e171 = left;
-            uint corner_1 = ((floatBitsToUint(float(int((_e169 & (0u - _e171))))) >> 23u) - 127u);
-            uvec3 offset_2 = (uvec3(corner_1, (corner_1 >> 1u), (corner_1 >> 2u)) & uvec3(1u));
-            bool right = (offset_2.x != 0u);
-            bool back = (offset_2.y != 0u);
-            uint lower_1 = (back ? (right ? _e31.cell : _e25.cell) : (right ? _e19.cell : _e13.cell));
-            uint upper = (back ? (right ? _e55.cell : _e49.cell) : (right ? _e43.cell : _e37.cell));
-            uint found = ((offset_2.z != 0u) ? upper : lower_1);
-            bool _e217 = second;
-            uvec4 _e220 = psao_load_cell(((found * 2u) + (_e217 ? 1u : 0u)));
-            words = _e220;
-            bool _e222 = second;
-            if (!(_e222)) {
-                uint _e227 = words.x;
-                uint _e231 = psao_weigh(_e3, (base + offset_2), 1u, 1u);
-                local_14 = (_e227 != _e231);
-            } else {
-                local_14 = false;
-            }
-            bool _e234 = local_14;
-            if (_e234) {
-                words = uvec4(0u);
-            }
-            uint _e239 = words.x;
-            bool _e240 = second;
-            uint a = (_e240 ? _e239 : 0u);
-            uint _e243 = words.y;
-            bool _e245 = second;
-            if (_e245) {
-                local_15 = (a == 0u);
-            } else {
-                local_15 = false;
-            }
-            bool _e251 = local_15;
-            uint b = (_e251 ? 0u : _e243);
-            uint _e255 = words.z;
-            uint c = ((b != 0u) ? _e255 : 0u);
-            uint _e261 = words.w;
-            uint d_4 = ((c != 0u) ? _e261 : 0u);
-            float _e266 = psao_side(_e4.place, offset_2);
-            vec3 place_2 = ((_e4.place - vec3(0.015625)) - vec3(ivec3(offset_2)));
-            bool _e274 = second;
-            if (_e274) {
-                psao_add(sums_1, inverse_radius2_1, _e4.normal, place_2, _e266, a);
-            }
-            psao_add(sums_1, inverse_radius2_1, _e4.normal, place_2, _e266, b);
-            psao_add(sums_1, inverse_radius2_1, _e4.normal, place_2, _e266, c);
-            psao_add(sums_1, inverse_radius2_1, _e4.normal, place_2, _e266, d_4);
-            bool _e279 = second;
-            if (!(_e279)) {
-                local_16 = (d_4 != 0u);
-            } else {
-                local_16 = false;
-            }
-            bool _e286 = local_16;
-            second = _e286;
-            uint _e287 = left;
-            uint _e288 = left;
-            uint _e292 = left;
-            bool _e293 = second;
-            left = (_e293 ? _e292 : (_e287 & (_e288 - 1u)));
+            uint _e18 = block_3.unsure;
+            uint _e19 = psao_lowest(_e18);
+            uvec3 _e20 = psao_corner(_e19);
+            uint _e21 = psao_bucket(_e9, _e20);
+            uint _e22 = psao_key(_e9, _e20);
+            uint _e23 = psao_search(_e21, _e22);
+            PsaoBlock _e24 = block_3;
+            PsaoBlock _e25 = psao_with(_e24, _e19, _e23);
+            block_3 = _e25;
+            uint _e27 = block_3.unsure;
+            uint _e29 = block_3.unsure;
+            block_3.unsure = (_e27 & (_e29 - 1u));
         }
     }
-    float _e296 = sums_1.y;
-    float _e298 = sums_1.x;
-    float _e305 = sums_1.x;
-    return ((_e305 > 0.0) ? min(((_e296 / _e298) * 0.003921569), 1.0) : 1.0);
+    PsaoBlock _e33 = block_3;
+    uint _e34 = psao_corners(_e33);
+    left = _e34;
+    float inverse_radius2_1 = (1.0 / (_e3.radius * _e3.radius));
+    while(true) {
+        uint _e46 = left;
+        if ((_e46 != 0u)) {
+        } else {
+            break;
+        }
+        {
+            uint _e49 = left;
+            uint _e50 = psao_lowest(_e49);
+            uvec3 _e51 = psao_corner(_e50);
+            PsaoBlock _e52 = block_3;
+            uint _e53 = psao_cell_at(_e52, _e51);
+            uint _e54 = psao_key(_e9, _e51);
+            uint _e55 = round_1;
+            PsaoRound _e56 = psao_round(_e53, _e54, _e55);
+            vec3 at = (_e4.place - vec3(ivec3(_e51)));
+            float _e61 = psao_share(at);
+            vec3 place_3 = (at - vec3(0.015625));
+            vec2 _e65 = sums_1;
+            vec2 _e69 = psao_add(_e65, inverse_radius2_1, _e4.normal, place_3, _e61, _e56.points.x);
+            sums_1 = _e69;
+            vec2 _e70 = sums_1;
+            vec2 _e74 = psao_add(_e70, inverse_radius2_1, _e4.normal, place_3, _e61, _e56.points.y);
+            sums_1 = _e74;
+            vec2 _e75 = sums_1;
+            vec2 _e79 = psao_add(_e75, inverse_radius2_1, _e4.normal, place_3, _e61, _e56.points.z);
+            sums_1 = _e79;
+            uint _e81 = round_1;
+            round_1 = (_e56.more ? (_e81 + 1u) : 0u);
+            uint _e86 = left;
+            uint _e87 = left;
+            uint _e91 = left;
+            left = (_e56.more ? _e91 : (_e86 & (_e87 - 1u)));
+        }
+    }
+    float _e95 = sums_1.y;
+    float _e97 = sums_1.x;
+    float _e104 = sums_1.x;
+    return ((_e104 > 0.0) ? min(((_e95 / _e97) * 0.003921569), 1.0) : 1.0);
 }

@@ -168,7 +168,8 @@ impl Cells {
                 continue;
             }
             let home = truth.home(cell) as usize;
-            if self.mirror.buckets()[home] != truth.buckets[home] {
+            // With another key a cell's bucket is sent again: its tag on the GPU is another (format.md, 6.5).
+            if self.mirror.buckets()[home] != truth.buckets[home] || want.key != have.key {
                 dirty::mark(&mut self.send_buckets, bucket_count, home);
             }
             if differs(want, have, threshold) {

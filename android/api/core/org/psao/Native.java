@@ -56,12 +56,17 @@ final class Native {
     static native int dirtyRanges(
             long client, int buffer, int joinCount, long ranges, int capacityCount, Object keep);
 
+    static native int tagBuckets(
+            long client, int firstIndex, int count, long outBuckets, Object keep, Object keepOut);
+
     static native int lookup(
             long client, int instanceIndex, long positions, long normals, int count,
             long outOpenness, Object keep, Object keepPositions, Object keepNormals,
             Object keepOut);
 
     static native int release(long client, Object keep);
+
+    static native int markAllDirty(long client, Object keep);
 
     static native int hello(
             long uplink, long[] config, byte[] token, long topologyHash, long out,

@@ -253,6 +253,16 @@ public final class PsaoClient implements AutoCloseable {
         }
     }
 
+    void tagBuckets(int firstIndex, int count, PsaoBuffer outBuckets) {
+        enter(taker);
+        try {
+            PsaoException.check(Native.tagBuckets(
+                    client, firstIndex, count, outBuckets.address, this, outBuckets));
+        } finally {
+            leave(taker);
+        }
+    }
+
     /** A part of the memory. */
     ByteBuffer view(long address, int bytes) {
         return PsaoFrame.part(memory, address - memoryAddress, bytes);
@@ -311,6 +321,26 @@ public final class PsaoClient implements AutoCloseable {
         enter(taker);
         try {
             PsaoException.check(Native.release(client, this));
+        } finally {
+            leave(taker);
+        }
+    }
+
+    /**
+     * Makes everything dirty: call it when your buffers were lost with their device, or made anew.
+     * The next {@link #take} then gives the newest frame, even if you had it before, and its ranges
+     * cover the whole buffers.
+     *
+     * <p>Threads: taker. Time: constant; the next take's grows with the capacity. No garbage, lock
+     * or log.
+     *
+     * @throws PsaoException {@link PsaoResult#ERROR_ORDER}: a frame is taken; release it first
+     * @throws IllegalStateException if it is closed, or another thread is in the taker's part
+     */
+    public void markAllDirty() {
+        enter(taker);
+        try {
+            PsaoException.check(Native.markAllDirty(client, this));
         } finally {
             leave(taker);
         }

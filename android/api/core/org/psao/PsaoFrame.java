@@ -139,6 +139,30 @@ public final class PsaoFrame {
     }
 
     /**
+     * Copies buckets with a tag in each entry, which {@code psao_planar_fast} of the shaders wants:
+     * it then reads no cell in vain. Copy the dirty ranges of {@link #BUCKETS} so, and upload the
+     * copies instead of {@link #range}.
+     *
+     * @param firstIndex the first bucket
+     * @param count how many
+     * @param outBuckets 32 bytes for each, from its first byte
+     * @throws PsaoException {@link PsaoResult#ERROR_ORDER}: no frame is taken.
+     *     {@link PsaoResult#ERROR_VALUE}: there are no such buckets.
+     *     {@link PsaoResult#ERROR_CAPACITY}: the frame has more than 4194304 cells: upload the
+     *     buckets as they are, and call {@code psao_planar}
+     * @throws IllegalArgumentException if a number is below 0, or the buffer too short
+     * @throws IllegalStateException if the client is closed, or two threads take at once
+     */
+    public void tagBuckets(int firstIndex, int count, PsaoBuffer outBuckets) {
+        if (firstIndex < 0 || count < 0 || outBuckets.bytes().capacity() < 32L * count) {
+            throw new IllegalArgumentException(
+                    count + " buckets from " + firstIndex + " need 32 bytes each, and no number "
+                    + "below 0");
+        }
+        client.tagBuckets(firstIndex, count, outBuckets);
+    }
+
+    /**
      * First element of a range.
      *
      * @param index of the range, below what {@link #dirtyRanges} said
