@@ -8,6 +8,7 @@
 
 pub mod atlas;
 pub mod command;
+pub mod detail;
 mod elements;
 pub mod glb;
 pub mod rays;
