@@ -875,7 +875,7 @@ mod gpu {
 
     const MAPS: DepthMaps = DepthMaps {
         resolution: 512,
-        bias: 1.0,
+        bias: 0.004,
         readback_every: 0,
     };
 

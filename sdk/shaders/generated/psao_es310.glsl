@@ -6,6 +6,8 @@
 //     float psao_planar_fast(uint instance, vec3 position, vec3 normal)   planar, the quicker way
 //     float psao_planar(uint instance, vec3 position, vec3 normal)        planar, written plainly
 //     float psao_paper(uint instance, vec3 position, vec3 normal)
+//     float psao_over_baked(uint kernel, uint instance, vec3 position, vec3 normal, float baked,
+//         float share)    the stream where it covers the place, a baked value where it does not
 // The first is quicker only if the buckets have tags: docs/gpu.md says how to put them there.
 // instance: index into the instance buffer, below its capacity.
 // position: in the instance's local space (rest space where it is skinned or morphed). It must come
@@ -47,6 +49,8 @@ const float PSAO_CORE = 0.2;
 const float PSAO_FADE = 0.3;
 const float PSAO_SEEN = 0.2;
 const float PSAO_UNSEEN = 0.001;
+const float PSAO_NEAR = 0.5;
+const uint PSAO_PAPER = 0u;
 const uint PSAO_ENTRY_CELL = 4194303u;
 
 layout(std430, binding = 0) readonly buffer psao_instances_block { uvec4 psao_instances[]; };
@@ -194,7 +198,11 @@ float psao_side(vec3 place, uvec3 offset) {
     return ((sides.x * sides.y) * sides.z);
 }
 
-float psao_blend(bool planar, uint instance_2, vec3 position_2, vec3 normal_4) {
+float psao_seen(float openness) {
+    return (min((openness / PSAO_SEEN), 1.0) + PSAO_UNSEEN);
+}
+
+vec2 psao_blend(bool planar, uint instance_2, vec3 position_2, vec3 normal_4) {
     float weights = 0.0;
     float sum = 0.0;
     uint corner = 0u;
@@ -203,99 +211,103 @@ float psao_blend(bool planar, uint instance_2, vec3 position_2, vec3 normal_4) {
     PsaoGrid _e4 = psao_grid(instance_2);
     PsaoFragment _e5 = psao_fragment(_e4, position_2, normal_4);
     if (_e5.outside) {
-        return 1.0;
+        return vec2(1.0, 0.0);
     }
     bool loop_init_1 = true;
     while(true) {
         if (!loop_init_1) {
-            uint _e92 = corner;
-            corner = (_e92 + 1u);
+            uint _e89 = corner;
+            corner = (_e89 + 1u);
         }
         loop_init_1 = false;
-        uint _e14 = corner;
-        if ((_e14 < 8u)) {
+        uint _e16 = corner;
+        if ((_e16 < 8u)) {
         } else {
             break;
         }
         {
-            uint _e17 = corner;
-            uint _e18 = corner;
-            uint _e21 = corner;
-            uvec3 offset_1 = (uvec3(_e17, (_e18 >> 1u), (_e21 >> 2u)) & uvec3(1u));
+            uint _e19 = corner;
+            uint _e20 = corner;
+            uint _e23 = corner;
+            uvec3 offset_1 = (uvec3(_e19, (_e20 >> 1u), (_e23 >> 2u)) & uvec3(1u));
             uvec3 cell_3 = (uvec3(_e5.base) + offset_1);
             if (any(greaterThanEqual(cell_3, _e4.dims))) {
                 continue;
             }
-            uint _e34 = psao_find(_e4, cell_3);
-            if ((_e34 == 0u)) {
+            uint _e36 = psao_find(_e4, cell_3);
+            if ((_e36 == 0u)) {
                 continue;
             }
             vec3 corner_from = (vec3(offset_1) - _e5.place);
-            float _e41 = psao_side(_e5.place, offset_1);
+            float _e43 = psao_side(_e5.place, offset_1);
             i_1 = 1u;
             bool loop_init_2 = true;
             while(true) {
                 if (!loop_init_2) {
-                    uint _e89 = i_1;
-                    i_1 = (_e89 + 1u);
+                    uint _e86 = i_1;
+                    i_1 = (_e86 + 1u);
                 }
                 loop_init_2 = false;
-                uint _e44 = i_1;
-                if ((_e44 < 8u)) {
+                uint _e46 = i_1;
+                if ((_e46 < 8u)) {
                 } else {
                     break;
                 }
                 {
-                    uint _e49 = i_1;
-                    uvec4 _e53 = psao_load_cell(((_e34 * 2u) + (_e49 >> 2u)));
-                    uint _e54 = i_1;
-                    uint point_4 = _e53[(_e54 & 3u)];
+                    uint _e51 = i_1;
+                    uvec4 _e55 = psao_load_cell(((_e36 * 2u) + (_e51 >> 2u)));
+                    uint _e56 = i_1;
+                    uint point_4 = _e55[(_e56 & 3u)];
                     if ((point_4 == 0u)) {
                         break;
                     }
                     if ((point_4 < 2147483648u)) {
                         continue;
                     }
-                    vec3 _e62 = psao_point_place(point_4);
-                    vec3 d_2 = (corner_from + _e62);
-                    vec3 _e64 = psao_point_normal(point_4);
-                    float _e65 = psao_point_openness(point_4);
+                    vec3 _e64 = psao_point_place(point_4);
+                    vec3 d_2 = (corner_from + _e64);
+                    vec3 _e66 = psao_point_normal(point_4);
+                    float _e67 = psao_point_openness(point_4);
                     weight = 0.0;
                     if (planar) {
-                        float seen = (min((_e65 / PSAO_SEEN), 1.0) + PSAO_UNSEEN);
-                        float _e77 = psao_planar_weight(_e4.radius, _e5.normal, d_2, _e64);
-                        weight = ((_e41 * seen) * _e77);
+                        float _e70 = psao_seen(_e67);
+                        float _e74 = psao_planar_weight(_e4.radius, _e5.normal, d_2, _e66);
+                        weight = ((_e43 * _e70) * _e74);
                     } else {
-                        float _e81 = psao_paper_weight(_e4.radius, _e5.normal, d_2, _e64);
-                        weight = _e81;
+                        float _e78 = psao_paper_weight(_e4.radius, _e5.normal, d_2, _e66);
+                        weight = _e78;
                     }
-                    float _e82 = weights;
+                    float _e79 = weights;
+                    float _e80 = weight;
+                    weights = (_e79 + _e80);
+                    float _e82 = sum;
                     float _e83 = weight;
-                    weights = (_e82 + _e83);
-                    float _e85 = sum;
-                    float _e86 = weight;
-                    sum = (_e85 + (_e86 * _e65));
+                    sum = (_e82 + (_e83 * _e67));
                 }
             }
         }
     }
-    float _e95 = weights;
-    if ((_e95 > 0.0)) {
-        float _e98 = sum;
-        float _e99 = weights;
-        return min((_e98 / _e99), 1.0);
+    float _e92 = weights;
+    if ((_e92 > 0.0)) {
+        float _e95 = sum;
+        float _e96 = weights;
+        float openness_1 = min((_e95 / _e96), 1.0);
+        float _e100 = psao_seen(openness_1);
+        float seen = (planar ? _e100 : 1.0);
+        float _e103 = weights;
+        return vec2(openness_1, min((_e103 / (PSAO_NEAR * seen)), 1.0));
     }
-    return 1.0;
+    return vec2(1.0, 0.0);
 }
 
 float psao_planar(uint instance_3, vec3 position_3, vec3 normal_5) {
-    float _e4 = psao_blend(true, instance_3, position_3, normal_5);
-    return _e4;
+    vec2 _e4 = psao_blend(true, instance_3, position_3, normal_5);
+    return _e4.x;
 }
 
 float psao_paper(uint instance_4, vec3 position_4, vec3 normal_6) {
-    float _e4 = psao_blend(false, instance_4, position_4, normal_6);
-    return _e4;
+    vec2 _e4 = psao_blend(false, instance_4, position_4, normal_6);
+    return _e4.x;
 }
 
 uint psao_tag(uint key) {
@@ -325,12 +337,12 @@ void psao_add(inout vec2 sums, float inverse_radius2_, vec3 normal_7, vec3 place
     float point_along = dot(m, d_3);
     float h2_ = max((along_1 * along_1), ((point_along * point_along) * inverse_1));
     float apart_1 = (PSAO_CORE + ((dot(d_3, d_3) + (PSAO_FLATNESS * h2_)) * inverse_radius2_));
-    float openness = float(int((point_3 & 255u)));
-    float seen_1 = (min((openness * 0.019607844), 1.0) + PSAO_UNSEEN);
+    float openness_2 = float(int((point_3 & 255u)));
+    float seen_1 = (min((openness_2 * 0.019607844), 1.0) + PSAO_UNSEEN);
     float agree4_1 = (agree2_1 * agree2_1);
     float weight_1 = ((((side * seen_1) * agree4_1) * agree4_1) / (apart_1 * apart_1));
     vec2 _e94 = sums;
-    sums = (_e94 + (((point_3 >= 2147483648u) ? weight_1 : 0.0) * vec2(1.0, openness)));
+    sums = (_e94 + (((point_3 >= 2147483648u) ? weight_1 : 0.0) * vec2(1.0, openness_2)));
     return;
 }
 
@@ -382,7 +394,7 @@ PsaoCandidate psao_candidate(PsaoGrid grid_3, float inverse_count, uvec3 cell_2)
     return PsaoCandidate((_e23.cell + _e32.cell), _e57);
 }
 
-float psao_planar_fast(uint instance_5, vec3 position_5, vec3 normal_8) {
+vec2 psao_blend_fast(uint instance_5, vec3 position_5, vec3 normal_8) {
     bool local_7 = false;
     bool local_8 = false;
     bool local_9 = false;
@@ -400,139 +412,165 @@ float psao_planar_fast(uint instance_5, vec3 position_5, vec3 normal_8) {
     PsaoGrid _e3 = psao_grid(instance_5);
     PsaoFragment _e4 = psao_fragment(_e3, position_5, normal_8);
     if (_e4.outside) {
-        return 1.0;
+        return vec2(1.0, 0.0);
     }
     float inverse_count_1 = (1.0 / float(_e3.bucket_count));
     uvec3 base = uvec3(_e4.base);
-    PsaoCandidate _e13 = psao_candidate(_e3, inverse_count_1, base);
-    PsaoCandidate _e19 = psao_candidate(_e3, inverse_count_1, (base + uvec3(1u, 0u, 0u)));
-    PsaoCandidate _e25 = psao_candidate(_e3, inverse_count_1, (base + uvec3(0u, 1u, 0u)));
-    PsaoCandidate _e31 = psao_candidate(_e3, inverse_count_1, (base + uvec3(1u, 1u, 0u)));
-    PsaoCandidate _e37 = psao_candidate(_e3, inverse_count_1, (base + uvec3(0u, 0u, 1u)));
-    PsaoCandidate _e43 = psao_candidate(_e3, inverse_count_1, (base + uvec3(1u, 0u, 1u)));
-    PsaoCandidate _e49 = psao_candidate(_e3, inverse_count_1, (base + uvec3(0u, 1u, 1u)));
-    PsaoCandidate _e55 = psao_candidate(_e3, inverse_count_1, (base + uvec3(1u, 1u, 1u)));
-    if (!(_e13.unsure)) {
-        local_7 = _e19.unsure;
+    PsaoCandidate _e15 = psao_candidate(_e3, inverse_count_1, base);
+    PsaoCandidate _e21 = psao_candidate(_e3, inverse_count_1, (base + uvec3(1u, 0u, 0u)));
+    PsaoCandidate _e27 = psao_candidate(_e3, inverse_count_1, (base + uvec3(0u, 1u, 0u)));
+    PsaoCandidate _e33 = psao_candidate(_e3, inverse_count_1, (base + uvec3(1u, 1u, 0u)));
+    PsaoCandidate _e39 = psao_candidate(_e3, inverse_count_1, (base + uvec3(0u, 0u, 1u)));
+    PsaoCandidate _e45 = psao_candidate(_e3, inverse_count_1, (base + uvec3(1u, 0u, 1u)));
+    PsaoCandidate _e51 = psao_candidate(_e3, inverse_count_1, (base + uvec3(0u, 1u, 1u)));
+    PsaoCandidate _e57 = psao_candidate(_e3, inverse_count_1, (base + uvec3(1u, 1u, 1u)));
+    if (!(_e15.unsure)) {
+        local_7 = _e21.unsure;
     } else {
         local_7 = true;
     }
-    bool _e62 = local_7;
-    if (!(_e62)) {
-        local_8 = _e25.unsure;
+    bool _e64 = local_7;
+    if (!(_e64)) {
+        local_8 = _e27.unsure;
     } else {
         local_8 = true;
     }
-    bool _e68 = local_8;
-    if (!(_e68)) {
-        local_9 = _e31.unsure;
+    bool _e70 = local_8;
+    if (!(_e70)) {
+        local_9 = _e33.unsure;
     } else {
         local_9 = true;
     }
-    bool _e74 = local_9;
-    if (!(_e74)) {
-        local_10 = _e37.unsure;
+    bool _e76 = local_9;
+    if (!(_e76)) {
+        local_10 = _e39.unsure;
     } else {
         local_10 = true;
     }
-    bool _e80 = local_10;
-    if (!(_e80)) {
-        local_11 = _e43.unsure;
+    bool _e82 = local_10;
+    if (!(_e82)) {
+        local_11 = _e45.unsure;
     } else {
         local_11 = true;
     }
-    bool _e86 = local_11;
-    if (!(_e86)) {
-        local_12 = _e49.unsure;
+    bool _e88 = local_11;
+    if (!(_e88)) {
+        local_12 = _e51.unsure;
     } else {
         local_12 = true;
     }
-    bool _e92 = local_12;
-    if (!(_e92)) {
-        local_13 = _e55.unsure;
+    bool _e94 = local_12;
+    if (!(_e94)) {
+        local_13 = _e57.unsure;
     } else {
         local_13 = true;
     }
-    bool _e98 = local_13;
-    if (_e98) {
-        float _e99 = psao_planar(instance_5, position_5, normal_8);
-        return _e99;
+    bool _e100 = local_13;
+    if (_e100) {
+        vec2 _e102 = psao_blend(true, instance_5, position_5, normal_8);
+        return _e102;
     }
-    left = (((((((((_e13.cell != 0u) ? 1u : 0u) | ((_e19.cell != 0u) ? 2u : 0u)) | ((_e25.cell != 0u) ? 4u : 0u)) | ((_e31.cell != 0u) ? 8u : 0u)) | ((_e37.cell != 0u) ? 16u : 0u)) | ((_e43.cell != 0u) ? 32u : 0u)) | ((_e49.cell != 0u) ? 64u : 0u)) | ((_e55.cell != 0u) ? 128u : 0u));
+    left = (((((((((_e15.cell != 0u) ? 1u : 0u) | ((_e21.cell != 0u) ? 2u : 0u)) | ((_e27.cell != 0u) ? 4u : 0u)) | ((_e33.cell != 0u) ? 8u : 0u)) | ((_e39.cell != 0u) ? 16u : 0u)) | ((_e45.cell != 0u) ? 32u : 0u)) | ((_e51.cell != 0u) ? 64u : 0u)) | ((_e57.cell != 0u) ? 128u : 0u));
     float inverse_radius2_1 = (1.0 / (_e3.radius * _e3.radius));
     while(true) {
-        uint _e166 = left;
-        if ((_e166 != 0u)) {
+        uint _e169 = left;
+        if ((_e169 != 0u)) {
         } else {
             break;
         }
         {
-            uint _e169 = left;
-            uint _e171 = left;
-            uint corner_1 = ((floatBitsToUint(float(int((_e169 & (0u - _e171))))) >> 23u) - 127u);
+            uint _e172 = left;
+            uint _e174 = left;
+            uint corner_1 = ((floatBitsToUint(float(int((_e172 & (0u - _e174))))) >> 23u) - 127u);
             uvec3 offset_2 = (uvec3(corner_1, (corner_1 >> 1u), (corner_1 >> 2u)) & uvec3(1u));
             bool right = (offset_2.x != 0u);
             bool back = (offset_2.y != 0u);
-            uint lower_1 = (back ? (right ? _e31.cell : _e25.cell) : (right ? _e19.cell : _e13.cell));
-            uint upper = (back ? (right ? _e55.cell : _e49.cell) : (right ? _e43.cell : _e37.cell));
-            uint found = ((offset_2.z != 0u) ? upper : lower_1);
-            bool _e217 = second;
-            uvec4 _e220 = psao_load_cell(((found * 2u) + (_e217 ? 1u : 0u)));
-            words = _e220;
-            bool _e222 = second;
-            if (!(_e222)) {
-                uint _e227 = words.x;
-                uint _e231 = psao_weigh(_e3, (base + offset_2), 1u, 1u);
-                local_14 = (_e227 != _e231);
+            uint lower_1 = (back ? (right ? _e33.cell : _e27.cell) : (right ? _e21.cell : _e15.cell));
+            uint upper = (back ? (right ? _e57.cell : _e51.cell) : (right ? _e45.cell : _e39.cell));
+            uint found_1 = ((offset_2.z != 0u) ? upper : lower_1);
+            bool _e220 = second;
+            uvec4 _e223 = psao_load_cell(((found_1 * 2u) + (_e220 ? 1u : 0u)));
+            words = _e223;
+            bool _e225 = second;
+            if (!(_e225)) {
+                uint _e230 = words.x;
+                uint _e234 = psao_weigh(_e3, (base + offset_2), 1u, 1u);
+                local_14 = (_e230 != _e234);
             } else {
                 local_14 = false;
             }
-            bool _e234 = local_14;
-            if (_e234) {
+            bool _e237 = local_14;
+            if (_e237) {
                 words = uvec4(0u);
             }
-            uint _e239 = words.x;
-            bool _e240 = second;
-            uint a = (_e240 ? _e239 : 0u);
-            uint _e243 = words.y;
-            bool _e245 = second;
-            if (_e245) {
+            uint _e242 = words.x;
+            bool _e243 = second;
+            uint a = (_e243 ? _e242 : 0u);
+            uint _e246 = words.y;
+            bool _e248 = second;
+            if (_e248) {
                 local_15 = (a == 0u);
             } else {
                 local_15 = false;
             }
-            bool _e251 = local_15;
-            uint b = (_e251 ? 0u : _e243);
-            uint _e255 = words.z;
-            uint c = ((b != 0u) ? _e255 : 0u);
-            uint _e261 = words.w;
-            uint d_4 = ((c != 0u) ? _e261 : 0u);
-            float _e266 = psao_side(_e4.place, offset_2);
+            bool _e254 = local_15;
+            uint b = (_e254 ? 0u : _e246);
+            uint _e258 = words.z;
+            uint c = ((b != 0u) ? _e258 : 0u);
+            uint _e264 = words.w;
+            uint d_4 = ((c != 0u) ? _e264 : 0u);
+            float _e269 = psao_side(_e4.place, offset_2);
             vec3 place_2 = ((_e4.place - vec3(0.015625)) - vec3(ivec3(offset_2)));
-            bool _e274 = second;
-            if (_e274) {
-                psao_add(sums_1, inverse_radius2_1, _e4.normal, place_2, _e266, a);
+            bool _e277 = second;
+            if (_e277) {
+                psao_add(sums_1, inverse_radius2_1, _e4.normal, place_2, _e269, a);
             }
-            psao_add(sums_1, inverse_radius2_1, _e4.normal, place_2, _e266, b);
-            psao_add(sums_1, inverse_radius2_1, _e4.normal, place_2, _e266, c);
-            psao_add(sums_1, inverse_radius2_1, _e4.normal, place_2, _e266, d_4);
-            bool _e279 = second;
-            if (!(_e279)) {
+            psao_add(sums_1, inverse_radius2_1, _e4.normal, place_2, _e269, b);
+            psao_add(sums_1, inverse_radius2_1, _e4.normal, place_2, _e269, c);
+            psao_add(sums_1, inverse_radius2_1, _e4.normal, place_2, _e269, d_4);
+            bool _e282 = second;
+            if (!(_e282)) {
                 local_16 = (d_4 != 0u);
             } else {
                 local_16 = false;
             }
-            bool _e286 = local_16;
-            second = _e286;
-            uint _e287 = left;
-            uint _e288 = left;
-            uint _e292 = left;
-            bool _e293 = second;
-            left = (_e293 ? _e292 : (_e287 & (_e288 - 1u)));
+            bool _e289 = local_16;
+            second = _e289;
+            uint _e290 = left;
+            uint _e291 = left;
+            uint _e295 = left;
+            bool _e296 = second;
+            left = (_e296 ? _e295 : (_e290 & (_e291 - 1u)));
         }
     }
-    float _e296 = sums_1.y;
-    float _e298 = sums_1.x;
-    float _e305 = sums_1.x;
-    return ((_e305 > 0.0) ? min(((_e296 / _e298) * 0.003921569), 1.0) : 1.0);
+    float _e299 = sums_1.y;
+    float _e301 = sums_1.x;
+    float openness_3 = min(((_e299 / _e301) * 0.003921569), 1.0);
+    float _e308 = sums_1.x;
+    float _e310 = psao_seen(openness_3);
+    float near = min((_e308 / (PSAO_NEAR * _e310)), 1.0);
+    float _e320 = sums_1.x;
+    return ((_e320 > 0.0) ? vec2(openness_3, near) : vec2(1.0, 0.0));
+}
+
+float psao_planar_fast(uint instance_6, vec3 position_6, vec3 normal_9) {
+    vec2 _e3 = psao_blend_fast(instance_6, position_6, normal_9);
+    return _e3.x;
+}
+
+float psao_over_baked(uint kernel, uint instance_7, vec3 position_7, vec3 normal_10, float baked, float share) {
+    vec2 found = vec2(1.0, 0.0);
+    if ((share <= 0.0)) {
+        return baked;
+    }
+    if ((kernel == PSAO_PAPER)) {
+        vec2 _e15 = psao_blend(false, instance_7, position_7, normal_10);
+        found = _e15;
+    } else {
+        vec2 _e16 = psao_blend_fast(instance_7, position_7, normal_10);
+        found = _e16;
+    }
+    float _e18 = found.x;
+    float _e20 = found.y;
+    return mix(baked, _e18, (_e20 * min(share, 1.0)));
 }

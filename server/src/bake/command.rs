@@ -82,8 +82,9 @@ pub struct BakeArgs {
     /// Texels an edge of a depth map
     #[arg(long, value_name = "TEXELS", default_value_t = 1024)]
     pub resolution: u32,
-    /// Texels of a depth map that elements are lifted off their surface
-    #[arg(long, value_name = "TEXELS", default_value_t = 0.75)]
+    /// How far over an element something must be to hide it, in texels of a depth map; more where
+    /// surfaces slant
+    #[arg(long, value_name = "TEXELS", default_value_t = 0.004)]
     pub bias: f32,
     /// Directions between two read-backs from the GPU; 0 for one read-back at the end
     #[arg(long, value_name = "N", default_value_t = 0)]

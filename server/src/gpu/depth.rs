@@ -58,7 +58,7 @@ pub fn bake(
     }
     let gpu = Gpu::open()?;
     let (middle, radius) = stage.sphere();
-    // A little larger, so that what is lifted stays within the map.
+    // A little larger, so that what lies on it stays within the map.
     let radius = radius * (1.0 + 4.0 / maps.resolution.max(1) as f32);
     let work = Work::new(&gpu, stage, elements, numbers, maps, middle)?;
 
