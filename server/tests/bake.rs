@@ -632,7 +632,7 @@ fn picture(path: &Path, image: usize) -> (Vec<u8>, usize) {
 /// root mean square of the angle between normals, degrees, and of openness in 1/255.
 /// `normal_at`: the detailed surface's normal at a place on it.
 fn baked_onto(detailed: &Mesh, plain: &Mesh, normal_at: impl Fn(Vec3) -> Vec3) -> [f64; 2] {
-    const SIZE: usize = 512;
+    const SIZE: usize = 256;
     let folder = tempfile::tempdir().expect("a folder");
     let out = folder.path().join("out.glb");
     let high = mesh_file(folder.path(), "detailed", detailed);
@@ -640,7 +640,16 @@ fn baked_onto(detailed: &Mesh, plain: &Mesh, normal_at: impl Fn(Vec3) -> Vec3) -
     let low = low.to_str().expect("a plain name");
     let size = SIZE.to_string();
     let more = [
-        "--onto", low, "--to", "texture", "--size", &size, "--cage", "0.2",
+        "--onto",
+        low,
+        "--to",
+        "texture",
+        "--size",
+        &size,
+        "--cage",
+        "0.2",
+        "--directions",
+        "128",
     ];
     let report = run(&args(&high, &out, &more), &|_, _, _| ()).expect("sound scenes");
     assert_eq!(report.notes, [""; 0], "every texel has its place");
@@ -654,6 +663,7 @@ fn baked_onto(detailed: &Mesh, plain: &Mesh, normal_at: impl Fn(Vec3) -> Vec3) -
     };
     let scene = Scene::load(&out, 1.0).expect("a sound file");
     let stage = alone(detailed.clone());
+    let origin = stage.scene.origin.as_vec3();
     let tracer = stage.tracer().expect("a small scene");
     let step = (scene.meshes[0].triangles.len() / 400).max(1);
     let (mut angles, mut seen, mut elements) = (0.0, Vec::new(), Vec::new());
@@ -676,14 +686,14 @@ fn baked_onto(detailed: &Mesh, plain: &Mesh, normal_at: impl Fn(Vec3) -> Vec3) -
 
             let from = mean(&positions) + normal * 0.2;
             let hit = tracer
-                .closest(from, -normal, 0.4)
+                .closest(from - origin, -normal, 0.4)
                 .expect("the detailed mesh");
             let place = from - normal * hit.t;
             let expected = normal_at(place);
             angles += f64::from(bumped.angle_between(expected).to_degrees()).powi(2);
             seen.push(f32::from(grey[texel]) / 255.0);
             elements.push(Element {
-                position: place,
+                position: place - origin,
                 normal: expected,
                 outward: expected,
                 // The place has been rounded once more.
@@ -708,8 +718,9 @@ fn waves_baked_onto_a_plane_look_as_the_waves_within_a_degree_and_two_percent() 
         )
     };
     let (mut detailed, mut plain) = (Mesh::default(), Mesh::default());
+    // Another extent than the plane's, and so another origin.
     sheet(&mut detailed, 200, |u, v| {
-        waves(4.0 * v - 2.0, 4.0 * u - 2.0)
+        waves(5.0 * v - 2.0, 4.0 * u - 2.0)
     });
     sheet(&mut plain, 2, |u, v| {
         (Vec3::new(3.9 * v - 1.95, 0.0, 3.9 * u - 1.95), Vec3::Y)

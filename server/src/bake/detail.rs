@@ -17,8 +17,8 @@ use rayon::prelude::*;
 
 /// What a plain scene's texels stand for.
 pub struct Detail {
-    /// The place on the detailed scene; on the plain one where there is none within the cage. In
-    /// the order of [`super::texels`].
+    /// The place on the detailed scene, from its origin; on the plain one where there is none
+    /// within the cage. In the order of [`super::texels`].
     pub elements: Vec<Element>,
     /// Unit normal there, in the texel's tangent space.
     pub normals: Vec<Vec3>,
@@ -55,11 +55,14 @@ impl Detail {
             .map(|(instance, charts)| tangents(plain, instance, charts))
             .collect();
         let tracer = detailed.tracer()?;
+        // Each scene's metres are from an origin of its own.
+        let shift = (plain.scene.origin - detailed.scene.origin).as_vec3();
         let places: Vec<(Element, Option<Vec3>)> = covered(atlas)
             .par_iter()
             .map(|texel| {
                 let at = texel.instance as usize;
-                let own = surfaces[at].element(&texel.point);
+                let mut own = surfaces[at].element(&texel.point);
+                own.position += shift;
                 let start = own.position + own.normal * cage_m;
                 let Some(hit) = tracer.closest(start, -own.normal, 2.0 * cage_m) else {
                     return (own, None);
