@@ -98,9 +98,9 @@ impl Answer {
         } else {
             baked.clamp(0.0, 1.0)
         };
-        // Not above 1 or below 0 for a NaN either.
-        let share = share.max(0.0).min(1.0) * self.near;
-        baked + (self.openness - baked) * share
+        // A share that is NaN shows nothing of the stream.
+        let share = if share > 0.0 { share.min(1.0) } else { 0.0 };
+        baked + (self.openness - baked) * (share * self.near)
     }
 }
 
