@@ -600,7 +600,8 @@ psao_result psao_client_lookup(const struct psao_client *client,
  * have not come yet, and where it left them out because all is open.
  *
  * baked: count values, 0 to 1. share: how much of the stream to show where it has come, 0 to 1,
- * of psao_status.stream_share. With 0 no frame need be taken, and the answers are the baked values.
+ * of psao_status.stream_share. With 0 no frame need be taken, and the baked values are the
+ * answers.
  *
  * out_openness: count values, 0 to 1, never NaN. May be baked.
  *

@@ -4,7 +4,6 @@ use crate::front::{Front, Shown};
 use crate::handoff::{Before, Handoff};
 use crate::result::psao_result::{self, *};
 use crate::types::*;
-use psao::core::lookup::Answer;
 use psao::core::mirror::{Buffer, Capacity};
 use psao::core::stream::{Frame, Header, PREAMBLE, Packet, kind};
 use psao::memory::{Limits, Line, Source};
@@ -939,7 +938,8 @@ pub unsafe extern "C" fn psao_client_lookup(
 /// have not come yet, and where it left them out because all is open.
 ///
 /// baked: count values, 0 to 1. share: how much of the stream to show where it has come, 0 to 1,
-/// of psao_status.stream_share. With 0 no frame need be taken, and the answers are the baked values.
+/// of psao_status.stream_share. With 0 no frame need be taken, and the baked values are the
+/// answers.
 ///
 /// out_openness: count values, 0 to 1, never NaN. May be baked.
 ///
@@ -973,7 +973,7 @@ pub unsafe extern "C" fn psao_client_lookup_over_baked(
             if (baked.is_null() || out_openness.is_null()) && count > 0 {
                 return Err(PSAO_ERROR_NULL);
             }
-            let each = |answer: &dyn Fn(usize) -> Answer| {
+            let each = |answer: &dyn Fn(usize) -> psao::core::lookup::Answer| {
                 for at in 0..count {
                     let value = answer(at).over_baked(baked.add(at).read_unaligned(), share);
                     out_openness.add(at).write_unaligned(value);
@@ -981,7 +981,7 @@ pub unsafe extern "C" fn psao_client_lookup_over_baked(
                 Ok(PSAO_OK)
             };
             if share == 0.0 {
-                return each(&|_| Answer::OPEN);
+                return each(&|_| psao::core::lookup::Answer::OPEN);
             }
             client.with_taken(|front, shown| {
                 let lookup = shown.buffers();

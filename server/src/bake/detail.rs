@@ -1,5 +1,5 @@
-//! From a detailed mesh to a plain one: which place of the detailed mesh each texel of the plain one
-//! stands for, and the normal there as a normal map holds it.
+//! From a detailed mesh to a plain one: which place of the detailed mesh each texel of the plain
+//! one stands for, and the normal there as a normal map holds it.
 //!
 //! Tangent space is glTF's: T along u, B = cross(N, T) * w up in the picture (against v), N the
 //! interpolated normal. The tangents are written to the file, so that no viewer makes its own: a
