@@ -167,10 +167,10 @@ enum {
  *
  * Two sides use it: the pusher (psao_client_push, psao_client_restart, psao_client_header,
  * psao_client_topology_hash, psao_client_stats, psao_client_error_text) and the taker
- * (psao_client_take, psao_client_dirty_ranges, psao_client_lookup, psao_client_release). Each side
- * must be one thread at a time. With psao_config.two_threads both sides may run at once, and
- * neither ever waits for the other; without, they must not. psao_client_status is anyone's, at any
- * time. */
+ * (psao_client_take, psao_client_dirty_ranges, psao_client_lookup, psao_client_lookup_over_baked,
+ * psao_client_release). Each side must be one thread at a time. With psao_config.two_threads both
+ * sides may run at once, and neither ever waits for the other; without, they must not.
+ * psao_client_status is anyone's, at any time. */
 typedef struct psao_client psao_client;
 
 #if defined(PSAO_QUIC)
@@ -219,6 +219,9 @@ typedef struct psao_config {
   uint32_t max_body_bytes;
   /* Largest decompressed packet. 0: the format's limit, 4 MiB. */
   uint32_t max_raw_bytes;
+  /* For engines that have baked occlusion: how long the first frame takes to come up over it,
+   * in psao_status.stream_share. 0: it is there at once. */
+  uint64_t ease_ns;
 } psao_config;
 
 /* What the stream says of itself. */
@@ -256,6 +259,10 @@ typedef struct psao_status {
   /* The last time, by your clock, at which the frame was the server's: while not live, AO is
    * what it was then. 0: never. */
   uint64_t live_ns;
+  /* How much of the stream to show over baked occlusion: 0 before the first frame was taken,
+   * 1 psao_config.ease_ns after it came. For psao_client_lookup_over_baked and the shaders'
+   * psao_over_baked. */
+  float stream_share;
 } psao_status;
 
 /* Totals since init, and the newest frame. */
@@ -421,6 +428,10 @@ uint32_t psao_version(void);
  *
  * Threads: any. No alloc, lock or log. Since ABI 1. */
 uint32_t psao_abi_version(void);
+
+extern void psao_guard_run(void (*run)(void*), void *argument);
+
+extern void psao_guard_leave(void);
 
 /* Fills a config with just what a stream needs, from its first bytes: of a recording, or of what
  * a server sends. Zeroes the rest of it but struct_size.
@@ -604,6 +615,29 @@ psao_result psao_client_lookup(const struct psao_client *client,
                                const float *normals,
                                size_t count,
                                float *out_openness);
+
+/* As psao_client_lookup, over occlusion that was baked (psao bake --to vertex or texture): where
+ * the stream covers a place it answers, elsewhere the baked value does. That is where its points
+ * have not come yet, and where it left them out because all is open.
+ *
+ * baked: count values, 0 to 1. share: how much of the stream to show where it has come, 0 to 1,
+ * of psao_status.stream_share. With 0 no frame need be taken, and the baked values are the
+ * answers.
+ *
+ * out_openness: count values, 0 to 1, never NaN. May be baked.
+ *
+ * PSAO_ERROR_VALUE: share is not 0 to 1. PSAO_ERROR_ORDER: no frame is taken, and share is not 0.
+ *
+ * Threads: taker. Time: grows with count. No alloc, lock or log. Safe on untrusted input. Since
+ * ABI 1. */
+psao_result psao_client_lookup_over_baked(const struct psao_client *client,
+                                          uint32_t instance_index,
+                                          const float *positions,
+                                          const float *normals,
+                                          const float *baked,
+                                          float share,
+                                          size_t count,
+                                          float *out_openness);
 
 /* Gives the frame back. Everything that was dirty in it counts as uploaded.
  *

@@ -2,6 +2,7 @@
 
 use glam::Vec3;
 use psao::{Client, Config};
+use psao_core::lookup::Answer;
 use psao_core::mirror::{Borrowed, Buffer, Capacity, PartsMut};
 use psao_core::residual::Quantiser;
 use psao_core::{Bucket, Cell, Kernel, Mirror};
@@ -10,7 +11,7 @@ use psao_gpu::{Buffers, Pass, Tier};
 use psao_server::args::camera_path;
 use psao_server::camera::Frustum;
 use psao_server::encode::{Encoder, Limits, Scheme, View as SeenBy, capacity_of};
-use psao_server::render::View;
+use psao_server::render::{Fragment, View};
 use psao_server::scene::Scene;
 use psao_server::world::{Options, World};
 use std::path::{Path, PathBuf};
@@ -45,6 +46,19 @@ impl Shot {
         self.view
             .blend(self.client.mirror().lookup(), kernel)
             .openness
+    }
+
+    /// What the CPU's lookup finds; nothing where nothing was drawn.
+    fn answers(&self, kernel: Kernel) -> Vec<Option<Answer>> {
+        let lookup = self.client.mirror().lookup();
+        let fragments = self.view.fragments.iter();
+        let answer = |fragment: &Fragment| {
+            let (position, normal) = (fragment.position.to_array(), fragment.normal.to_array());
+            lookup.blend(kernel, fragment.instance, position, normal)
+        };
+        fragments
+            .map(|fragment| fragment.as_ref().map(answer))
+            .collect()
     }
 
     /// The G-buffer's two textures: positions and instances, normals.
@@ -425,8 +439,47 @@ fn fast_takes_fewer_milliseconds_than_exact() {
 
 #[test]
 fn the_text_for_fragment_shaders_gives_the_same_picture() {
+    let picture = drawn(&ATRIUM, "psao_planar_fast(instance, position, normal)");
+    assert_exact(&ATRIUM, "fragment", &picture, Kernel::Planar);
+}
+
+#[test]
+fn over_baked_values_the_shader_shows_what_the_cpu_does() {
+    for (kernel, number) in [(Kernel::Paper, 0), (Kernel::Planar, 1)] {
+        for share in [0.0, 0.5, 1.0] {
+            let call =
+                format!("psao_over_baked({number}u, instance, position, normal, 0.25, {share:?})");
+            let picture = drawn(&ATRIUM, &call);
+            let answers = ATRIUM.answers(kernel);
+            let shown = |answer: &Option<Answer>| answer.map_or(1.0, |a| a.over_baked(0.25, share));
+            let expected: Vec<f32> = answers.iter().map(shown).collect();
+            let [one, _, largest] = compare(&ATRIUM, &picture, &expected);
+            assert!(
+                one == 0.0,
+                "{kernel:?}, share {share}: {one}, up to {largest}"
+            );
+            let baked = answers.iter().flatten().filter(|a| a.near < 0.01).count();
+            let streamed = answers.iter().flatten().filter(|a| a.near == 1.0).count();
+            assert!(
+                baked > 100 && streamed > WIDTH * HEIGHT / 4,
+                "{baked}, {streamed}"
+            );
+        }
+    }
+}
+
+/// A picture by a fragment shader that calls a lookup; 1 where nothing was drawn.
+fn drawn(shot: &Shot, call: &str) -> Vec<f32> {
     let gpu = &*GPU;
-    let shot = &*ATRIUM;
+    let shade = "
+    let found = textureLoad(positions, vec2<i32>(at.xy), 0);
+    let normal = textureLoad(normals, vec2<i32>(at.xy), 0).xyz;
+    let position = bitcast<vec3<f32>>(found.xyz);
+    let instance = found.w;
+    if instance == 0xffffffffu {
+        return vec4<f32>(1.0);
+    }
+";
     let text = psao_gpu::wgsl(1)
         + "
 @group(0) @binding(0) var positions: texture_2d<u32>;
@@ -434,13 +487,11 @@ fn the_text_for_fragment_shaders_gives_the_same_picture() {
 @vertex fn corner(@builtin(vertex_index) index: u32) -> @builtin(position) vec4<f32> {
     return vec4<f32>(f32(index & 1u) * 4.0 - 1.0, f32(index >> 1u) * 4.0 - 1.0, 0.0, 1.0);
 }
-@fragment fn shade(@builtin(position) at: vec4<f32>) -> @location(0) vec4<f32> {
-    let position = textureLoad(positions, vec2<i32>(at.xy), 0);
-    let normal = textureLoad(normals, vec2<i32>(at.xy), 0).xyz;
-    if position.w == 0xffffffffu {
-        return vec4<f32>(1.0);
-    }
-    return vec4<f32>(psao_planar_fast(position.w, bitcast<vec3<f32>>(position.xyz), normal));
+@fragment fn shade(@builtin(position) at: vec4<f32>) -> @location(0) vec4<f32> {"
+        + shade
+        + "    return vec4<f32>("
+        + call
+        + ");
 }";
     let module = gpu
         .device
@@ -533,7 +584,7 @@ fn the_text_for_fragment_shaders_gives_the_same_picture() {
         run.draw(0..3, 0..1);
     }
     gpu.submit(encoder);
-    assert_exact(shot, "fragment", &gpu.read_texture(&target), Kernel::Planar);
+    gpu.read_texture(&target)
 }
 
 #[test]

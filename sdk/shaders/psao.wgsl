@@ -5,6 +5,8 @@
 // What to call:
 //     psao_planar(instance, position, normal)    the default kernel
 //     psao_paper(instance, position, normal)     Neff et al., Eq. 2 to 4
+//     psao_over_baked(kernel, instance, position, normal, baked, share)
+//                                                either, and a baked value where no point is
 // Ask the stream's header which of the two its points were made for.
 //     instance    index into the instance buffer; below the buffer's capacity
 //     position    in the instance's local space (rest space where it is skinned or morphed), in
@@ -35,6 +37,10 @@ const PSAO_FADE: f32 = 0.3;
 const PSAO_SEEN: f32 = 0.2;
 // `planar`: what a point counts at least, however dark.
 const PSAO_UNSEEN: f32 = 0.001;
+// From this weight on, points that are not dark are near.
+const PSAO_NEAR: f32 = 0.5;
+// The kernel `paper`, as the stream's header numbers it.
+const PSAO_PAPER: u32 = 0u;
 // A bucket's entry: the cell's index, and above it a tag of its key (psao_tag) or 0 for none.
 const PSAO_ENTRY_CELL: u32 = 0x3fffffu;
 
@@ -176,12 +182,18 @@ fn psao_side(place: vec3<f32>, offset: vec3<u32>) -> f32 {
     return sides.x * sides.y * sides.z;
 }
 
-// The blend, written plainly: each of the 8 cells is found, each of its points weighed.
-fn psao_blend(planar: bool, instance: u32, position: vec3<f32>, normal: vec3<f32>) -> f32 {
+// How much a point of this openness counts for `planar`.
+fn psao_seen(openness: f32) -> f32 {
+    return min(openness / PSAO_SEEN, 1.0) + PSAO_UNSEEN;
+}
+
+// The blend, written plainly: each of the 8 cells is found, each of its points weighed. The
+// openness, and how far points cover the place: 0 where none is near, 1 where enough are.
+fn psao_blend(planar: bool, instance: u32, position: vec3<f32>, normal: vec3<f32>) -> vec2<f32> {
     let grid = psao_grid(instance);
     let fragment = psao_fragment(grid, position, normal);
     if fragment.outside {
-        return 1.0;
+        return vec2<f32>(1.0, 0.0);
     }
     var weights = 0.0;
     var sum = 0.0;
@@ -211,8 +223,7 @@ fn psao_blend(planar: bool, instance: u32, position: vec3<f32>, normal: vec3<f32
             let openness = psao_point_openness(point);
             var weight = 0.0;
             if planar {
-                let seen = min(openness / PSAO_SEEN, 1.0) + PSAO_UNSEEN;
-                weight = side * seen
+                weight = side * psao_seen(openness)
                     * psao_planar_weight(grid.radius, fragment.normal, d, point_normal);
             } else {
                 weight = psao_paper_weight(grid.radius, fragment.normal, d, point_normal);
@@ -222,20 +233,23 @@ fn psao_blend(planar: bool, instance: u32, position: vec3<f32>, normal: vec3<f32
         }
     }
     if weights > 0.0 {
-        return min(sum / weights, 1.0);
+        let openness = min(sum / weights, 1.0);
+        // Dark points weigh less, but are as near.
+        let seen = select(1.0, psao_seen(openness), planar);
+        return vec2<f32>(openness, min(weights / (PSAO_NEAR * seen), 1.0));
     }
-    return 1.0;
+    return vec2<f32>(1.0, 0.0);
 }
 
 // s · (min(1, 5o) + 0.001) · max(0.1, n·nₚ)⁸ / (0.2 + (d² + 11h²)/r²)² with
 // h = max(|n·d|, |nₚ·d|), o the point's openness and s its cell's part; open where no point is.
 fn psao_planar(instance: u32, position: vec3<f32>, normal: vec3<f32>) -> f32 {
-    return psao_blend(true, instance, position, normal);
+    return psao_blend(true, instance, position, normal).x;
 }
 
 // The paper's Eq. 2 to 4; open where no point counts.
 fn psao_paper(instance: u32, position: vec3<f32>, normal: vec3<f32>) -> f32 {
-    return psao_blend(false, instance, position, normal);
+    return psao_blend(false, instance, position, normal).x;
 }
 
 // ---- The same as psao_planar, in fewer steps, for buckets with tags. Without them it gives the
@@ -498,11 +512,12 @@ fn psao_add(
     return fma(vec2<f32>(weight), vec2<f32>(1.0, point.openness), sums);
 }
 
-fn psao_planar_fast(instance: u32, position: vec3<f32>, normal: vec3<f32>) -> f32 {
+// What psao_blend gives.
+fn psao_blend_fast(instance: u32, position: vec3<f32>, normal: vec3<f32>) -> vec2<f32> {
     let grid = psao_grid_fast(instance);
     let fragment = psao_fragment(grid, position, normal);
     if fragment.outside {
-        return 1.0;
+        return vec2<f32>(1.0, 0.0);
     }
     // First all cells that may be there, then their points: fragments side by side spend as many
     // rounds as they have cells, and not always eight.
@@ -532,5 +547,39 @@ fn psao_planar_fast(instance: u32, position: vec3<f32>, normal: vec3<f32>) -> f3
         round = select(0u, round + 1u, now.more);
         left = select(left & (left - 1u), left, now.more);
     }
-    return select(1.0, min(sums.y / sums.x * (1.0 / 255.0), 1.0), sums.x > 0.0);
+    let openness = min(sums.y / sums.x * (1.0 / 255.0), 1.0);
+    let near = min(sums.x / (PSAO_NEAR * psao_seen(openness)), 1.0);
+    return select(vec2<f32>(1.0, 0.0), vec2<f32>(openness, near), sums.x > 0.0);
+}
+
+fn psao_planar_fast(instance: u32, position: vec3<f32>, normal: vec3<f32>) -> f32 {
+    return psao_blend_fast(instance, position, normal).x;
+}
+
+// ---- For an engine that has baked values. ----
+
+// The stream where it covers the place, a baked value where it does not: its points have not come,
+// or it left them out because all is open there.
+//     kernel   of the stream's header, 0 paper, 1 planar
+//     baked    openness of the fragment, 0 to 1: a vertex attribute's or a texture's
+//     share    how much of the stream to show, 0 to 1 (psao_status.stream_share). At 0 the buffers
+//              are not read: they need not be filled yet.
+fn psao_over_baked(
+    kernel: u32,
+    instance: u32,
+    position: vec3<f32>,
+    normal: vec3<f32>,
+    baked: f32,
+    share: f32,
+) -> f32 {
+    if share <= 0.0 {
+        return baked;
+    }
+    var found = vec2<f32>(1.0, 0.0);
+    if kernel == PSAO_PAPER {
+        found = psao_blend(false, instance, position, normal);
+    } else {
+        found = psao_blend_fast(instance, position, normal);
+    }
+    return mix(baked, found.x, found.y * min(share, 1.0));
 }

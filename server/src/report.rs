@@ -204,7 +204,7 @@ impl Plot {
     }
 
     /// `None` without a single finite point.
-    fn svg(&self) -> Option<String> {
+    pub(crate) fn svg(&self) -> Option<String> {
         let y_of = |y: f64| if self.log_y { y.log10() } else { y };
         let series: Vec<Vec<(f64, f64)>> = self
             .series

@@ -15,6 +15,7 @@ use psao_server::scene::{Instance, LocalTransform, Mesh, Node, Scene};
 use serde_json::{Value, json};
 use small_scene::small_scene;
 use std::path::{Path, PathBuf};
+use std::process::Command;
 
 const ENDLESS: Method = Method::Rays {
     distance_m: f32::INFINITY,
@@ -347,7 +348,7 @@ fn file(folder: &Path) -> PathBuf {
 }
 
 #[derive(Parser)]
-struct Command {
+struct Words {
     #[command(flatten)]
     bake: BakeArgs,
 }
@@ -356,7 +357,7 @@ fn args(scene: &Path, out: &Path, more: &[&str]) -> BakeArgs {
     let paths = [scene, Path::new("--out"), out].map(Path::as_os_str);
     let words = std::iter::once("bake".as_ref()).chain(paths);
     let words = words.chain(more.iter().map(std::ffi::OsStr::new));
-    Command::try_parse_from(words).expect("these options").bake
+    Words::try_parse_from(words).expect("these options").bake
 }
 
 /// Bakes the file above; what was written, as JSON.
@@ -542,6 +543,299 @@ fn points_and_harmonics_are_written_where_readers_find_them() {
 }
 
 #[test]
+fn harmonics_in_textures_are_those_of_their_texels() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let to = ["--to", "sh-texture", "--size", "64", "--directions", "256"];
+    let (out, json) = baked(folder.path(), &to);
+    let transfer = &json["materials"]
+        .as_array()
+        .expect("materials")
+        .last()
+        .expect("one")["extras"]["psaoTransfer"];
+    assert_eq!(transfer["order"], 3);
+    assert_eq!(transfer["textures"].as_array().map(Vec::len), Some(3));
+    let stage = Stage::new(Scene::load(&folder.path().join("scene.gltf"), 1.0).expect("sound"));
+    let (places, elements) = texels(&stage, &Atlas::new(&stage, 64, &[]).expect("a small scene"));
+    let numbers = Numbers::Transfer(3);
+    let expected = bake(&stage, &elements, numbers, ENDLESS, 256, &|_, _, _| ());
+    let expected = expected.expect("a small scene").values;
+    for part in 0..3 {
+        let (texels, channels) = picture(&out, part);
+        assert_eq!(channels, 3);
+        for (place, expected) in places.iter().zip(expected.chunks(9)) {
+            for channel in 0..3 {
+                let at = (*place as usize * 3 + channel) * 2;
+                let word = u16::from_be_bytes([texels[at], texels[at + 1]]);
+                let value = f32::from(word) / 65535.0 * 2.0 - 1.0;
+                let expected = expected[part * 3 + channel];
+                assert!((value - expected).abs() < 1e-4, "{value}, not {expected}");
+            }
+        }
+    }
+}
+
+/// A mesh alone as a glTF file.
+fn mesh_file(folder: &Path, name: &str, mesh: &Mesh) -> PathBuf {
+    let vertices: Vec<f32> = (mesh.positions.iter().chain(&mesh.normals))
+        .flat_map(|v| v.to_array())
+        .collect();
+    let mut bytes: Vec<u8> = bytemuck::cast_slice(&vertices).to_vec();
+    let (count, half) = (mesh.positions.len(), bytes.len() / 2);
+    bytes.extend_from_slice(bytemuck::cast_slice(mesh.triangles.as_flattened()));
+    let bound = |pick: fn(Vec3, Vec3) -> Vec3| {
+        let all = mesh.positions.iter().copied();
+        all.reduce(pick).expect("vertices").to_array()
+    };
+    let json = json!({
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "NORMAL": 1}, "indices": 2}]}],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": count, "type": "VEC3",
+             "min": bound(Vec3::min), "max": bound(Vec3::max)},
+            {"bufferView": 1, "componentType": 5126, "count": count, "type": "VEC3"},
+            {"bufferView": 2, "componentType": 5125, "count": mesh.triangles.len() * 3,
+             "type": "SCALAR"},
+        ],
+        "bufferViews": [
+            {"buffer": 0, "byteLength": half},
+            {"buffer": 0, "byteOffset": half, "byteLength": half},
+            {"buffer": 0, "byteOffset": 2 * half, "byteLength": bytes.len() - 2 * half},
+        ],
+        "buffers": [{"byteLength": bytes.len(), "uri": format!("{name}.bin")}],
+    });
+    std::fs::write(folder.join(format!("{name}.bin")), bytes).expect("a folder");
+    let path = folder.join(format!("{name}.gltf"));
+    std::fs::write(&path, json.to_string()).expect("a folder");
+    path
+}
+
+/// A picture of a written file, and its channels.
+fn picture(path: &Path, image: usize) -> (Vec<u8>, usize) {
+    let bytes = std::fs::read(path).expect("it was written");
+    let file = gltf::Gltf::from_slice(&bytes).expect("a valid file");
+    let image = file.images().nth(image).expect("the image");
+    let gltf::image::Source::View { view, .. } = image.source() else {
+        panic!("the image is elsewhere");
+    };
+    let blob = file.blob.as_ref().expect("a binary chunk");
+    let png = std::io::Cursor::new(&blob[view.offset()..][..view.length()]);
+    let mut reader = png::Decoder::new(png).read_info().expect("a PNG");
+    let mut texels = vec![0; reader.output_buffer_size().expect("a small picture")];
+    let info = reader.next_frame(&mut texels).expect("a PNG");
+    (texels, info.color_type.samples())
+}
+
+/// Bakes one mesh onto another; what a viewer sees of it is compared with the detailed surface:
+/// root mean square of the angle between normals, degrees, and of openness in 1/255.
+/// `normal_at`: the detailed surface's normal at a place on it.
+fn baked_onto(detailed: &Mesh, plain: &Mesh, normal_at: impl Fn(Vec3) -> Vec3) -> [f64; 2] {
+    const SIZE: usize = 256;
+    let folder = tempfile::tempdir().expect("a folder");
+    let out = folder.path().join("out.glb");
+    let high = mesh_file(folder.path(), "detailed", detailed);
+    let low = mesh_file(folder.path(), "plain", plain);
+    let low = low.to_str().expect("a plain name");
+    let size = SIZE.to_string();
+    let more = [
+        "--onto",
+        low,
+        "--to",
+        "texture",
+        "--size",
+        &size,
+        "--cage",
+        "0.2",
+        "--directions",
+        "128",
+    ];
+    let report = run(&args(&high, &out, &more), &|_, _, _| ()).expect("sound scenes");
+    assert_eq!(report.notes, [""; 0], "every texel has its place");
+
+    let three = |name: &str| -> Vec<Vec3> { bytemuck::pod_collect_to_vec(&floats(&out, 0, name)) };
+    let (positions, normals) = (three("POSITION"), three("NORMAL"));
+    let tangents: Vec<[f32; 4]> = bytemuck::pod_collect_to_vec(&floats(&out, 0, "TANGENT"));
+    let uvs: Vec<Vec2> = bytemuck::pod_collect_to_vec(&floats(&out, 0, "TEXCOORD_0"));
+    let ((grey, 1), (colors, 3)) = (picture(&out, 0), picture(&out, 1)) else {
+        panic!("a grey and a coloured picture");
+    };
+    let scene = Scene::load(&out, 1.0).expect("a sound file");
+    let stage = alone(detailed.clone());
+    let origin = stage.scene.origin.as_vec3();
+    let tracer = stage.tracer().expect("a small scene");
+    let step = (scene.meshes[0].triangles.len() / 400).max(1);
+    let (mut angles, mut seen, mut elements) = (0.0, Vec::new(), Vec::new());
+    // The loader splits no vertices of a file that has normals.
+    for triangle in scene.meshes[0].triangles.iter().step_by(step) {
+        for weights in [[0.6, 0.2, 0.2], [0.2, 0.3, 0.5]] {
+            let corners = || triangle.iter().map(|v| *v as usize).zip(weights);
+            let mean = |of: &[Vec3]| corners().map(|(v, w)| of[v] * w).sum::<Vec3>();
+            // As a viewer's shader does.
+            let normal = mean(&normals).normalize();
+            let tangent = corners()
+                .map(|(v, w)| Vec3::from_slice(&tangents[v]) * w)
+                .sum::<Vec3>();
+            let tangent = tangent.normalize();
+            let bitangent = normal.cross(tangent) * tangents[triangle[0] as usize][3];
+            let uv = corners().map(|(v, w)| uvs[v] * w).sum::<Vec2>() * SIZE as f32;
+            let texel = uv.y as usize * SIZE + uv.x as usize;
+            let map = |axis: usize| f32::from(colors[texel * 3 + axis]) / 127.5 - 1.0;
+            let bumped = (tangent * map(0) + bitangent * map(1) + normal * map(2)).normalize();
+
+            let from = mean(&positions) + normal * 0.2;
+            let hit = tracer
+                .closest(from - origin, -normal, 0.4)
+                .expect("the detailed mesh");
+            let place = from - normal * hit.t;
+            let expected = normal_at(place);
+            angles += f64::from(bumped.angle_between(expected).to_degrees()).powi(2);
+            seen.push(f32::from(grey[texel]) / 255.0);
+            elements.push(Element {
+                position: place - origin,
+                normal: expected,
+                outward: expected,
+                // The place has been rounded once more.
+                reach: 64.0,
+            });
+        }
+    }
+    let reference = openness(&stage, &elements, ENDLESS, 4096);
+    let angle = (angles / elements.len() as f64).sqrt();
+    [angle, rmse_255(&seen, &reference)]
+}
+
+#[test]
+fn waves_baked_onto_a_plane_look_as_the_waves_within_a_degree_and_two_percent() {
+    let waves = |x: f32, z: f32| {
+        let height = 0.1 * (4.0 * x).sin() * (3.0 * z).cos();
+        let along = 0.4 * (4.0 * x).cos() * (3.0 * z).cos();
+        let across = -0.3 * (4.0 * x).sin() * (3.0 * z).sin();
+        (
+            Vec3::new(x, height, z),
+            Vec3::new(-along, 1.0, -across).normalize(),
+        )
+    };
+    let (mut detailed, mut plain) = (Mesh::default(), Mesh::default());
+    // Another extent than the plane's, and so another origin.
+    sheet(&mut detailed, 200, |u, v| {
+        waves(5.0 * v - 2.0, 4.0 * u - 2.0)
+    });
+    sheet(&mut plain, 2, |u, v| {
+        (Vec3::new(3.9 * v - 1.95, 0.0, 3.9 * u - 1.95), Vec3::Y)
+    });
+    let [angle, occlusion] = baked_onto(&detailed, &plain, |place| waves(place.x, place.z).1);
+    println!("waves: {angle} degrees, {occlusion}/255");
+    assert!(
+        angle < 1.0 && occlusion < 5.0,
+        "{angle} degrees, {occlusion}/255"
+    );
+}
+
+#[test]
+fn a_bumpy_ball_baked_onto_a_round_one_looks_bumpy_within_two_degrees_and_two_percent() {
+    use std::f32::consts::{PI, TAU};
+    // Bumps of a smooth function of space, so that no pole is special.
+    let radius = |out: Vec3| 1.0 + 0.04 * (7.0 * out.x).sin() * (6.0 * out.y).cos();
+    let slope = |out: Vec3| {
+        let (x, y) = (7.0 * out.x, 6.0 * out.y);
+        Vec3::new(0.28 * x.cos() * y.cos(), -0.24 * x.sin() * y.sin(), 0.0)
+    };
+    let normal = |out: Vec3| {
+        let tangential = slope(out).reject_from_normalized(out);
+        (out - tangential / radius(out)).normalize()
+    };
+    let ball = |mesh: &mut Mesh, steps: u32, bumpy: bool| {
+        sheet(mesh, steps, |u, v| {
+            let (across, around) = ((u * PI).sin(), v * TAU);
+            let x = across * around.cos();
+            let out = Vec3::new(x, (u * PI).cos(), -across * around.sin()).normalize();
+            match bumpy {
+                true => (out * radius(out), normal(out)),
+                false => (out, out),
+            }
+        });
+    };
+    let (mut detailed, mut plain) = (Mesh::default(), Mesh::default());
+    ball(&mut detailed, 256, true);
+    ball(&mut plain, 24, false);
+    let [angle, occlusion] = baked_onto(&detailed, &plain, |place| normal(place.normalize()));
+    println!("ball: {angle} degrees, {occlusion}/255");
+    assert!(
+        angle < 2.0 && occlusion < 5.0,
+        "{angle} degrees, {occlusion}/255"
+    );
+}
+
+/// Runs a program to its end, which must be a success.
+fn succeed(command: &mut Command) -> String {
+    let output = command.output();
+    let output = output.unwrap_or_else(|error| {
+        panic!("{command:?}: {error}: install it with `apt-get install nodejs npm`")
+    });
+    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
+    let (said, errors) = (text(&output.stdout), text(&output.stderr));
+    assert!(output.status.success(), "{command:?}:\n{said}{errors}");
+    said
+}
+
+#[test]
+fn khronos_validator_finds_no_error_in_what_is_written() {
+    let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/gltf_validator");
+    let installed = Path::new(env!("CARGO_TARGET_TMPDIR")).join("gltf_validator");
+    std::fs::create_dir_all(&installed).expect("a folder");
+    for name in ["package.json", "package-lock.json", "validate.js"] {
+        std::fs::copy(source.join(name), installed.join(name)).expect("a file of ours");
+    }
+    // Does nothing where it is there already, and checks its hash where not.
+    let install = ["install", "--no-audit", "--no-fund", "--prefer-offline"];
+    succeed(Command::new("npm").args(install).current_dir(&installed));
+
+    let folder = tempfile::tempdir().expect("a folder");
+    let scene = file(folder.path());
+    let onto = scene.to_str().expect("a plain name");
+    let texture = ["--to", "texture", "--size", "64"];
+    let detail = [&texture[..], &["--onto", onto]].concat();
+    let harmonics = [
+        &["--to", "sh-texture", "--size", "64", "--order", "4"][..],
+        &["--to", "sh", "--order", "2"],
+    ];
+    let all = [
+        &[][..],
+        &texture,
+        &detail,
+        &["--to", "points", "--density", "20"],
+    ];
+    let written: Vec<PathBuf> = (0..)
+        .zip(all.into_iter().chain(harmonics))
+        .map(|(number, more)| {
+            let out = folder.path().join(format!("{number}.glb"));
+            let more = [&["--directions", "4"], more].concat();
+            run(&args(&scene, &out, &more), &|_, _, _| ()).expect("a sound scene");
+            out
+        })
+        .collect();
+    let validate = |files: &[PathBuf]| {
+        let mut command = Command::new("node");
+        command
+            .arg("validate.js")
+            .args(files)
+            .current_dir(&installed);
+        command
+    };
+    let said = succeed(&mut validate(&written));
+    assert!(said.contains("6 files of glTF 2.0"), "{said}");
+    // It does look: a file with a hole in it is refused.
+    let broken = folder.path().join("broken.gltf");
+    let text = std::fs::read_to_string(&scene).expect("the scene");
+    let text = text.replace("\"bufferView\":3", "\"bufferView\":33");
+    std::fs::write(&broken, text).expect("a folder");
+    let output = validate(&[broken]).output().expect("it ran before");
+    assert!(!output.status.success(), "{output:?}");
+}
+
+#[test]
 fn bad_input_gives_an_error_that_names_it_and_leaves_no_file() {
     let folder = tempfile::tempdir().expect("a folder");
     let scene = file(folder.path());
@@ -567,6 +861,15 @@ fn bad_input_gives_an_error_that_names_it_and_leaves_no_file() {
     );
     refused(&scene, &["--to", "texture", "--size", "1"], "16 to");
     refused(&scene, &["--to", "points", "--density=-1"], "--density");
+    let onto = scene.to_str().expect("a plain name").to_string();
+    refused(&scene, &["--onto", &onto], "--to texture");
+    refused(&scene, &["--cage", "1"], "--onto");
+    let texture = ["--onto", &onto, "--to", "texture", "--size", "64", "--cage"];
+    refused(&scene, &[&texture[..], &["0"]].concat(), "--cage");
+    let mut far = Mesh::default();
+    sheet(&mut far, 1, |u, v| (Vec3::new(u, 90.0, v), Vec3::NEG_Y));
+    let far = mesh_file(folder.path(), "far", &far);
+    refused(&far, &[&texture[..], &["1"]].concat(), "--cage");
     refused(&folder.path().join("none.glb"), &[], "none.glb");
     let cut = folder.path().join("cut.gltf");
     std::fs::write(&cut, "{").expect("a folder");
@@ -583,7 +886,7 @@ mod gpu {
 
     const MAPS: DepthMaps = DepthMaps {
         resolution: 512,
-        bias: 1.0,
+        bias: 0.004,
         readback_every: 0,
     };
 

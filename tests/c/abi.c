@@ -17,9 +17,10 @@ static void check_layout(void) {
     CHECK(offsetof(psao_camera, forward) == 40 && offsetof(psao_camera, up) == 52);
     CHECK(offsetof(psao_config, scene_hash) == 8 && offsetof(psao_config, stale_after_ns) == 16);
     CHECK(offsetof(psao_config, log) == 24 && offsetof(psao_config, log_user_data) == 32);
-    CHECK(offsetof(psao_config, instance_count) == 40 && sizeof(psao_config) == 80);
+    CHECK(offsetof(psao_config, instance_count) == 40 && sizeof(psao_config) == 88);
+    CHECK(offsetof(psao_config, ease_ns) == 80 && offsetof(psao_status, stream_share) == 16);
     CHECK(offsetof(psao_frame, server_time_ns) == 8 && offsetof(psao_frame, instances) == 32);
-    CHECK(sizeof(psao_frame) == 56 && sizeof(psao_status) == 16);
+    CHECK(sizeof(psao_frame) == 56 && sizeof(psao_status) == 24);
     CHECK(sizeof(psao_header) == 48 && offsetof(psao_header, scene_hash) == 24);
     CHECK(offsetof(psao_stats, server_time_ns) == 8 && sizeof(psao_stats) == 112);
 }
@@ -123,11 +124,36 @@ static psao_result push_from(psao_client *client, bytes stream, size_t at, size_
     return psao_client_push(client, stream.data + at, stream.size - at, 200, used);
 }
 
+/* Halfway up, what the stream answers at its own points and the baked value count the same. */
+static void check_over_baked(psao_client *client, const psao_frame *frame) {
+    int compared = 0;
+    for (uint32_t i = 0; i < frame->instance_count; i++) {
+        const psao_instance *grid = &frame->instances[i];
+        float at[3], up[3] = {0, 1, 0}, open = -1, baked = 0.5f, full = -1, half = -1;
+        for (uint32_t cell = 0; grid->bucket_count > 0 && cell < 256; cell++) {
+            for (int axis = 0; axis < 3; axis++)
+                at[axis] = grid->origin[axis] +
+                           ((float)(cell * (1u + (uint32_t)axis) % grid->dims[axis]) + 0.5f) /
+                               grid->cells_per_unit[axis];
+            GIVES(PSAO_OK, psao_client_lookup(client, i, at, up, 1, &open));
+            GIVES(PSAO_OK,
+                  psao_client_lookup_over_baked(client, i, at, up, &baked, 1, 1, &full));
+            GIVES(PSAO_OK,
+                  psao_client_lookup_over_baked(client, i, at, up, &baked, 0.5f, 1, &half));
+            CHECK(half >= (full + baked) / 2 - 1e-6f && half <= (full + baked) / 2 + 1e-6f);
+            CHECK((full - baked) * (open - baked) >= 0);
+            compared += full == open && open != baked;
+        }
+    }
+    CHECK(compared > 0);
+}
+
 static void check_order(bytes stream) {
     psao_config config = config_of(stream);
     config.log = take_message;
     config.log_user_data = &messages;
     config.stale_after_ns = 1000;
+    config.ease_ns = 200;
     owned made = make(&config);
     psao_client *client = made.client;
     size_t used = 99;
@@ -141,7 +167,7 @@ static void check_order(bytes stream) {
     memset(&stats, 0, sizeof stats);
     psao_range ranges[4];
     uint32_t count = 77;
-    float at[3] = {0, 0, 0}, up[3] = {0, 1, 0}, open = -1;
+    float at[3] = {0, 0, 0}, up[3] = {0, 1, 0}, open = -1, baked = 0.25f, both = -1;
 
     GIVES(PSAO_ERROR_STRUCT, psao_client_take(client, &frame));
     frame.struct_size = sizeof frame;
@@ -154,6 +180,12 @@ static void check_order(bytes stream) {
     status.struct_size = sizeof status;
     GIVES(PSAO_OK, psao_client_status(client, 5, &status));
     CHECK(status.state == PSAO_STATE_CONNECTING && status.live_ns == 0);
+    CHECK(status.stream_share == 0);
+    /* Baked values are there before the stream. */
+    GIVES(PSAO_OK, psao_client_lookup_over_baked(client, 0, at, up, &baked, 0, 1, &both));
+    CHECK(both == baked);
+    both = -1;
+    GIVES(PSAO_ERROR_ORDER, psao_client_lookup_over_baked(client, 0, at, up, &baked, 1, 1, &both));
 
     GIVES(PSAO_ERROR_NULL, psao_client_push(NULL, stream.data, 1, 0, &used));
     GIVES(PSAO_ERROR_NULL, psao_client_push(client, NULL, 1, 0, &used));
@@ -164,6 +196,8 @@ static void check_order(bytes stream) {
 
     GIVES(PSAO_OK, psao_client_push(client, stream.data, stream.size, 100, &used));
     CHECK(used > 0 && used < stream.size);
+    GIVES(PSAO_OK, psao_client_status(client, 100, &status));
+    CHECK(status.stream_share == 0); /* nobody has it yet */
     GIVES(PSAO_ERROR_NULL, psao_client_take(NULL, &frame));
     GIVES(PSAO_ERROR_NULL, psao_client_take(client, NULL));
     GIVES(PSAO_OK, psao_client_take(client, &frame));
@@ -190,6 +224,18 @@ static void check_order(bytes stream) {
     CHECK(open == -1);
     GIVES(PSAO_OK, psao_client_lookup(client, 0xffffffff, at, up, 1, &open));
     CHECK(open == 1);
+    GIVES(PSAO_ERROR_NULL, psao_client_lookup_over_baked(client, 0, at, up, NULL, 1, 1, &both));
+    GIVES(PSAO_ERROR_NULL, psao_client_lookup_over_baked(client, 0, at, up, &baked, 1, 1, NULL));
+    GIVES(PSAO_ERROR_VALUE, psao_client_lookup_over_baked(client, 0, at, up, &baked, 2, 1, &both));
+    CHECK(both == -1);
+    GIVES(PSAO_OK,
+          psao_client_lookup_over_baked(client, 0xffffffff, at, up, &baked, 1, 1, &both));
+    CHECK(both == baked);
+    check_over_baked(client, &frame);
+    GIVES(PSAO_OK, psao_client_status(client, 150, &status));
+    CHECK(status.stream_share == 0.25f);
+    GIVES(PSAO_OK, psao_client_status(client, 300, &status));
+    CHECK(status.stream_share == 1);
     GIVES(PSAO_OK, psao_client_release(client));
     GIVES(PSAO_ERROR_ORDER, psao_client_release(client));
     GIVES(PSAO_NOTHING_NEW, psao_client_take(client, &frame));

@@ -31,6 +31,10 @@ pub const SEEN: f32 = 0.2;
 /// [`Kernel::Planar`]: what a point counts at least, however dark.
 pub const UNSEEN: f32 = 0.001;
 
+/// From this weight on, points that are not dark are near: what a baked value is for is not there
+/// any more. A point of [`Kernel::Planar`] at the fragment weighs 25, one at the radius 0.7.
+pub const NEAR: f32 = 0.5;
+
 /// How the points around a fragment are weighted.
 #[repr(u8)]
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -69,14 +73,35 @@ pub struct Answer {
     pub weight: f32,
     /// Points read.
     pub fetched: u32,
+    /// How far the stream covers the place: 0 where no point lies near that faces as the fragment
+    /// does, 1 where enough do, and without a step between.
+    pub near: f32,
 }
 
 impl Answer {
-    const OPEN: Answer = Answer {
+    /// What a place without points gets.
+    pub const OPEN: Answer = Answer {
         openness: 1.0,
         weight: 0.0,
         fetched: 0,
+        near: 0.0,
     };
+
+    /// This answer where the stream covers the place, and a baked value where it does not.
+    ///
+    /// `baked`: openness, 0 to 1; one that is NaN counts as open. `share`: how much of the stream
+    /// to show where it has come, 0 to 1; rises over some frames after the first, so that nothing
+    /// flashes.
+    pub fn over_baked(&self, baked: f32, share: f32) -> f32 {
+        let baked = if baked.is_nan() {
+            1.0
+        } else {
+            baked.clamp(0.0, 1.0)
+        };
+        // A share that is NaN shows nothing of the stream.
+        let share = if share > 0.0 { share.min(1.0) } else { 0.0 };
+        baked + (self.openness - baked) * (share * self.near)
+    }
 }
 
 type Vec3 = [f32; 3];
@@ -168,6 +193,11 @@ fn to_cell_space(normal: Vec3, grid: &Instance) -> Option<Vec3> {
     Some([n[0] * scale, n[1] * scale, n[2] * scale])
 }
 
+/// How much a point of this openness counts for [`Kernel::Planar`].
+fn seen(openness: f32) -> f32 {
+    (openness * (1.0 / SEEN)).min(1.0) + UNSEEN
+}
+
 struct Blend {
     kernel: Kernel,
     normal: Vec3,
@@ -204,10 +234,7 @@ impl Blend {
             self.fetched += 1;
             let weight = match self.kernel {
                 Kernel::Paper => self.paper(d, squared, point_normal),
-                Kernel::Planar => {
-                    let seen = (openness * (1.0 / SEEN)).min(1.0) + UNSEEN;
-                    side * seen * self.planar(d, squared, point_normal)
-                }
+                Kernel::Planar => side * seen(openness) * self.planar(d, squared, point_normal),
             };
             self.weight += weight;
             self.sum += weight * openness;
@@ -236,16 +263,24 @@ impl Blend {
 
     /// Eq. 4.
     fn answer(&self) -> Answer {
-        let openness = if self.weight > 0.0 {
-            // The quotient of two sums may round past the largest value blended.
-            (self.sum / self.weight).min(1.0)
-        } else {
-            1.0
+        if self.weight <= 0.0 {
+            return Answer {
+                fetched: self.fetched,
+                ..Answer::OPEN
+            };
+        }
+        // The quotient of two sums may round past the largest value blended.
+        let openness = (self.sum / self.weight).min(1.0);
+        // Dark points weigh less, but are as near.
+        let seen = match self.kernel {
+            Kernel::Paper => 1.0,
+            Kernel::Planar => seen(openness),
         };
         Answer {
             openness,
             weight: self.weight,
             fetched: self.fetched,
+            near: (self.weight / (NEAR * seen)).min(1.0),
         }
     }
 }
@@ -343,6 +378,47 @@ mod tests {
     }
 
     #[test]
+    fn baked_values_show_where_no_point_is_and_give_way_without_a_step() {
+        for (kernel, occlusion) in [
+            (Kernel::Planar, 102),
+            (Kernel::Planar, 0),
+            (Kernel::Paper, 102),
+        ] {
+            let (grid, buckets, cells) = scene([1, 1, 1], &[up(occlusion)]);
+            let lookup = Lookup {
+                instances: &[grid],
+                buckets: &buckets,
+                cells: &cells,
+            };
+            let at = |x: f32, up: f32| lookup.blend(kernel, 0, [x, 1.01, 1.6], [0.0, up, 0.0]);
+            let streamed = f32::from(occlusion) / 255.0;
+            let here = at(1.4, 1.0);
+            assert!(
+                (here.over_baked(0.9, 1.0) - streamed).abs() < 1e-6,
+                "{here:?}"
+            );
+            assert_eq!(here.over_baked(0.9, 0.0), 0.9);
+            let half = here.over_baked(0.9, 0.5);
+            assert!((half - (0.9 + streamed) / 2.0).abs() < 1e-6, "{half}");
+            // A slice that has not come, another instance, and the other side of a wall.
+            let (far, unknown) = (at(3.5, 1.0), lookup.blend(kernel, 9, [0.0; 3], [0.0; 3]));
+            for nothing in [far, unknown, at(1.4, -1.0)] {
+                let shown = nothing.over_baked(0.9, 1.0);
+                assert!((shown - 0.9).abs() < 1e-4, "{nothing:?}");
+            }
+            let steps = (0..2000).map(|i| at(0.4 + i as f32 * 1.1e-3, 1.0).over_baked(0.9, 1.0));
+            let steps: [f32; 2000] = {
+                let mut all = [0.0; 2000];
+                all.iter_mut().zip(steps).for_each(|(to, step)| *to = step);
+                all
+            };
+            for pair in steps.windows(2) {
+                assert!((pair[1] - pair[0]).abs() < 0.05, "{kernel:?}: {pair:?}");
+            }
+        }
+    }
+
+    #[test]
     fn no_input_gives_nan_or_a_panic() {
         let (mut grid, buckets, cells) = scene([0, 0, 0], &[up(0); 7]);
         let odd = [
@@ -372,6 +448,7 @@ mod tests {
                         ] {
                             let answer = lookup.blend(kernel, 0, position, normal);
                             assert!((0.0..=1.0).contains(&answer.openness), "{answer:?}");
+                            assert!((0.0..=1.0).contains(&answer.over_baked(a, b)), "{answer:?}");
                             let finite = |v: Vec3| v.iter().all(|v| v.is_finite());
                             if !(finite(position) && finite(normal)) {
                                 assert_eq!(answer.openness, 1.0);

@@ -22,10 +22,10 @@ const FIRST_BODY_BYTES: u32 = 4096;
 ///
 /// Two sides use it: the pusher (psao_client_push, psao_client_restart, psao_client_header,
 /// psao_client_topology_hash, psao_client_stats, psao_client_error_text) and the taker
-/// (psao_client_take, psao_client_dirty_ranges, psao_client_lookup, psao_client_release). Each side
-/// must be one thread at a time. With psao_config.two_threads both sides may run at once, and
-/// neither ever waits for the other; without, they must not. psao_client_status is anyone's, at any
-/// time.
+/// (psao_client_take, psao_client_dirty_ranges, psao_client_lookup, psao_client_lookup_over_baked,
+/// psao_client_release). Each side must be one thread at a time. With psao_config.two_threads both
+/// sides may run at once, and neither ever waits for the other; without, they must not.
+/// psao_client_status is anyone's, at any time.
 pub struct psao_client {
     /// A panic was stopped at the border: nothing in here can be relied on.
     poisoned: AtomicBool,
@@ -37,6 +37,10 @@ pub struct psao_client {
     shown: AtomicBool,
     /// The taker wants all of the frame, even if it had it before.
     again: AtomicBool,
+    /// When the first frame came; if one was taken.
+    first_ns: AtomicU64,
+    taken: AtomicBool,
+    ease_ns: u64,
     front: Handoff<Front>,
     /// The pusher's; with one thread, the taker's too while it has a frame.
     pusher: UnsafeCell<Pusher>,
@@ -197,6 +201,7 @@ impl Default for psao_config {
             topology_bytes: 0,
             max_body_bytes: 0,
             max_raw_bytes: 0,
+            ease_ns: 0,
         }
     }
 }
@@ -363,6 +368,9 @@ pub unsafe extern "C" fn psao_client_init(
             live_ns: AtomicU64::new(0),
             shown: AtomicBool::new(false),
             again: AtomicBool::new(false),
+            first_ns: AtomicU64::new(0),
+            taken: AtomicBool::new(false),
+            ease_ns: config.ease_ns,
             front: Handoff::new(front),
             pusher: UnsafeCell::new(Pusher {
                 client,
@@ -428,6 +436,19 @@ impl psao_client {
         }
     }
 
+    /// How much of the stream to show over baked values.
+    fn stream_share(&self, now_ns: u64) -> f32 {
+        // The taker wrote it behind what it has seen of the pusher.
+        if !self.taken.load(Ordering::Acquire) {
+            return 0.0;
+        }
+        let since_ns = now_ns.saturating_sub(self.first_ns.load(Ordering::Relaxed));
+        if since_ns >= self.ease_ns {
+            return 1.0;
+        }
+        since_ns as f32 / self.ease_ns as f32
+    }
+
     fn publish(&self, pusher: &Pusher) {
         self.state
             .store(pusher.client.state() as u32, Ordering::Relaxed);
@@ -468,7 +489,9 @@ impl psao_client {
             let fastest = pusher.fastest_ns.map_or(late, |fastest| fastest.min(late));
             pusher.fastest_ns = Some(fastest);
             pusher.delay_ns = u64::try_from(late - fastest).unwrap_or(0);
-            self.shown.store(true, Ordering::Relaxed);
+            if !self.shown.swap(true, Ordering::Relaxed) {
+                self.first_ns.store(now_ns, Ordering::Relaxed);
+            }
         }
         self.hand_over(pusher);
         if pusher.client.state() == State::Live {
@@ -678,6 +701,7 @@ pub unsafe extern "C" fn psao_client_status(
                 struct_size: 0,
                 state: state as u32,
                 live_ns,
+                stream_share: client.stream_share(now_ns),
             };
             write_struct(out_status, &status)?;
             Ok(PSAO_OK)
@@ -818,6 +842,7 @@ pub unsafe extern "C" fn psao_client_take(
             if !client.take() {
                 return Ok(PSAO_NOTHING_NEW);
             }
+            client.taken.store(true, Ordering::Release);
             let frame = client.with_taken(|front, shown| {
                 let buffers = shown.buffers();
                 Ok(psao_frame {
@@ -987,6 +1012,64 @@ pub unsafe extern "C" fn psao_client_lookup(
     }
 }
 
+/// As psao_client_lookup, over occlusion that was baked (psao bake --to vertex or texture): where
+/// the stream covers a place it answers, elsewhere the baked value does. That is where its points
+/// have not come yet, and where it left them out because all is open.
+///
+/// baked: count values, 0 to 1. share: how much of the stream to show where it has come, 0 to 1,
+/// of psao_status.stream_share. With 0 no frame need be taken, and the baked values are the
+/// answers.
+///
+/// out_openness: count values, 0 to 1, never NaN. May be baked.
+///
+/// PSAO_ERROR_VALUE: share is not 0 to 1. PSAO_ERROR_ORDER: no frame is taken, and share is not 0.
+///
+/// Threads: taker. Time: grows with count. No alloc, lock or log. Safe on untrusted input. Since
+/// ABI 1.
+///
+/// # Safety
+/// The pointers are as described.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn psao_client_lookup_over_baked(
+    client: *const psao_client,
+    instance_index: u32,
+    positions: *const f32,
+    normals: *const f32,
+    baked: *const f32,
+    share: f32,
+    count: usize,
+    out_openness: *mut f32,
+) -> psao_result {
+    // SAFETY: the caller's word; it is the taker's. Baked values are read one by one, each before
+    // its answer is written, so that both may be in one array.
+    unsafe {
+        with(client, |client| {
+            let positions = slice_of(positions.cast::<[f32; 3]>(), count)?;
+            let normals = slice_of(normals.cast::<[f32; 3]>(), count)?;
+            if !(0.0..=1.0).contains(&share) {
+                return Err(PSAO_ERROR_VALUE);
+            }
+            if (baked.is_null() || out_openness.is_null()) && count > 0 {
+                return Err(PSAO_ERROR_NULL);
+            }
+            let each = |answer: &dyn Fn(usize) -> psao::core::lookup::Answer| {
+                for at in 0..count {
+                    let value = answer(at).over_baked(baked.add(at).read_unaligned(), share);
+                    out_openness.add(at).write_unaligned(value);
+                }
+                Ok(PSAO_OK)
+            };
+            if share == 0.0 {
+                return each(&|_| psao::core::lookup::Answer::OPEN);
+            }
+            client.with_taken(|front, shown| {
+                let lookup = shown.buffers();
+                each(&|at| lookup.blend(front.kernel, instance_index, positions[at], normals[at]))
+            })
+        })
+    }
+}
+
 /// Gives the frame back. Everything that was dirty in it counts as uploaded.
 ///
 /// PSAO_ERROR_ORDER: no frame is taken.
@@ -1081,6 +1164,7 @@ mod tests {
                 struct_size: size_of::<psao_status>() as u32,
                 state: 77,
                 live_ns: 77,
+                stream_share: 77.0,
             };
             let asked = psao_client_status(client, 0, &mut status);
             assert_eq!((asked, status.state), (PSAO_ERROR_INTERNAL, 77));

@@ -67,6 +67,9 @@ pub struct psao_config {
     pub max_body_bytes: u32,
     /// Largest decompressed packet. 0: the format's limit, 4 MiB.
     pub max_raw_bytes: u32,
+    /// For engines that have baked occlusion: how long the first frame takes to come up over it,
+    /// in psao_status.stream_share. 0: it is there at once.
+    pub ease_ns: u64,
 }
 
 /// What the stream says of itself.
@@ -221,6 +224,10 @@ pub struct psao_status {
     /// The last time, by your clock, at which the frame was the server's: while not live, AO is
     /// what it was then. 0: never.
     pub live_ns: u64,
+    /// How much of the stream to show over baked occlusion: 0 before the first frame was taken,
+    /// 1 psao_config.ease_ns after it came. For psao_client_lookup_over_baked and the shaders'
+    /// psao_over_baked.
+    pub stream_share: f32,
 }
 
 /// Totals since init, and the newest frame.

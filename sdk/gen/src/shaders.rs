@@ -17,7 +17,8 @@ fn psao_probe(
     let planar = psao_planar(instance, position, normal);
     let paper = psao_paper(instance, position, normal);
     let fast = psao_planar_fast(instance, position, normal);
-    return vec4<f32>(planar, paper, fast, 1.0);
+    let over = psao_over_baked(instance, instance, position, normal, position.x, position.y);
+    return vec4<f32>(planar, paper, fast, over);
 }
 ";
 
@@ -31,6 +32,8 @@ const HEADER: &str = "\
 //     float psao_planar_fast(uint instance, vec3 position, vec3 normal)   planar, the quicker way
 //     float psao_planar(uint instance, vec3 position, vec3 normal)        planar, written plainly
 //     float psao_paper(uint instance, vec3 position, vec3 normal)
+//     float psao_over_baked(uint kernel, uint instance, vec3 position, vec3 normal, float baked,
+//         float share)    the stream where it covers the place, a baked value where it does not
 // The first is quicker only if the buckets have tags: docs/gpu.md says how to put them there.
 // instance: index into the instance buffer, below its capacity.
 // position: in the instance's local space (rest space where it is skinned or morphed). It must come
@@ -302,7 +305,8 @@ layout(location = 2) flat in uint instance;
 layout(location = 0) out vec4 color;
 void main() {
     color = vec4(psao_planar_fast(instance, position, normal), psao_planar(instance, position,
-        normal), psao_paper(instance, position, normal), 1.0);
+        normal), psao_paper(instance, position, normal),
+        psao_over_baked(1u, instance, position, normal, 0.5, 1.0));
 }
 ";
 
@@ -335,7 +339,8 @@ void main() {
 float4 main(float3 position : P, float3 normal : N, nointerpolation uint instance : I) : SV_Target
 {
     return float4(psao_planar_fast(instance, position, normal), psao_planar(instance, position,
-        normal), psao_paper(instance, position, normal), 1.0);
+        normal), psao_paper(instance, position, normal),
+        psao_over_baked(1u, instance, position, normal, 0.5, 1.0));
 }
 ";
         let text = snippet("psao.hlsl") + main;
@@ -378,7 +383,12 @@ float4 main(float3 position : P, float3 normal : N, nointerpolation uint instanc
                 !text.contains("type_"),
                 "{name} has a name of a type's number"
             );
-            for function in ["psao_planar_fast(", "psao_planar(", "psao_paper("] {
+            for function in [
+                "psao_planar_fast(",
+                "psao_planar(",
+                "psao_paper(",
+                "psao_over_baked(",
+            ] {
                 assert!(text.contains(function), "{name} lacks {function}");
             }
         }

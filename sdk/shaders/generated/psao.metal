@@ -6,6 +6,8 @@
 //     float psao_planar_fast(uint instance, vec3 position, vec3 normal)   planar, the quicker way
 //     float psao_planar(uint instance, vec3 position, vec3 normal)        planar, written plainly
 //     float psao_paper(uint instance, vec3 position, vec3 normal)
+//     float psao_over_baked(uint kernel, uint instance, vec3 position, vec3 normal, float baked,
+//         float share)    the stream where it covers the place, a baked value where it does not
 // The first is quicker only if the buckets have tags: docs/gpu.md says how to put them there.
 // instance: index into the instance buffer, below its capacity.
 // position: in the instance's local space (rest space where it is skinned or morphed). It must come
@@ -85,6 +87,8 @@ constant float PSAO_CORE = 0.2;
 constant float PSAO_FADE = 0.3;
 constant float PSAO_SEEN = 0.2;
 constant float PSAO_UNSEEN = 0.001;
+constant float PSAO_NEAR = 0.5;
+constant uint PSAO_PAPER = 0u;
 constant uint PSAO_ENTRY_CELL = 4194303u;
 
 metal::uint4 psao_load_instance(
@@ -289,7 +293,13 @@ float psao_side(
     return (sides.x * sides.y) * sides.z;
 }
 
-float psao_blend(
+float psao_seen(
+    float openness
+) {
+    return metal::min(openness / PSAO_SEEN, 1.0) + PSAO_UNSEEN;
+}
+
+metal::float2 psao_blend(
     bool planar,
     uint instance_2,
     metal::float3 position_2,
@@ -306,89 +316,93 @@ float psao_blend(
     PsaoGrid _e4 = psao_grid(instance_2, psao_instances);
     PsaoFragment _e5 = psao_fragment(_e4, position_2, normal_4);
     if (_e5.outside) {
-        return 1.0;
+        return metal::float2(1.0, 0.0);
     }
     bool loop_init_1 = true;
     while(true) {
         if (!loop_init_1) {
-            uint _e92 = corner;
-            corner = _e92 + 1u;
+            uint _e89 = corner;
+            corner = _e89 + 1u;
         }
         loop_init_1 = false;
-        uint _e14 = corner;
-        if (_e14 < 8u) {
+        uint _e16 = corner;
+        if (_e16 < 8u) {
         } else {
             break;
         }
         {
-            uint _e17 = corner;
-            uint _e18 = corner;
-            uint _e21 = corner;
-            metal::uint3 offset_4 = metal::uint3(_e17, _e18 >> 1u, _e21 >> 2u) & metal::uint3(1u);
+            uint _e19 = corner;
+            uint _e20 = corner;
+            uint _e23 = corner;
+            metal::uint3 offset_4 = metal::uint3(_e19, _e20 >> 1u, _e23 >> 2u) & metal::uint3(1u);
             metal::uint3 cell_4 = static_cast<metal::uint3>(_e5.base) + offset_4;
             if (metal::any(cell_4 >= _e4.dims)) {
                 continue;
             }
-            uint _e34 = psao_find(_e4, cell_4, psao_buckets, psao_cells);
-            if (_e34 == 0u) {
+            uint _e36 = psao_find(_e4, cell_4, psao_buckets, psao_cells);
+            if (_e36 == 0u) {
                 continue;
             }
             metal::float3 corner_from = static_cast<metal::float3>(offset_4) - _e5.place;
-            float _e41 = psao_side(_e5.place, offset_4);
+            float _e43 = psao_side(_e5.place, offset_4);
             i_1 = 1u;
             bool loop_init_2 = true;
             while(true) {
                 if (!loop_init_2) {
-                    uint _e89 = i_1;
-                    i_1 = _e89 + 1u;
+                    uint _e86 = i_1;
+                    i_1 = _e86 + 1u;
                 }
                 loop_init_2 = false;
-                uint _e44 = i_1;
-                if (_e44 < 8u) {
+                uint _e46 = i_1;
+                if (_e46 < 8u) {
                 } else {
                     break;
                 }
                 {
-                    uint _e49 = i_1;
-                    metal::uint4 _e53 = psao_load_cell((_e34 * 2u) + (_e49 >> 2u), psao_cells);
-                    uint _e54 = i_1;
-                    uint point_4 = _e53[_e54 & 3u];
+                    uint _e51 = i_1;
+                    metal::uint4 _e55 = psao_load_cell((_e36 * 2u) + (_e51 >> 2u), psao_cells);
+                    uint _e56 = i_1;
+                    uint point_4 = _e55[_e56 & 3u];
                     if (point_4 == 0u) {
                         break;
                     }
                     if (point_4 < 2147483648u) {
                         continue;
                     }
-                    metal::float3 _e62 = psao_point_place(point_4);
-                    metal::float3 d_2 = corner_from + _e62;
-                    metal::float3 _e64 = psao_point_normal(point_4);
-                    float _e65 = psao_point_openness(point_4);
+                    metal::float3 _e64 = psao_point_place(point_4);
+                    metal::float3 d_2 = corner_from + _e64;
+                    metal::float3 _e66 = psao_point_normal(point_4);
+                    float _e67 = psao_point_openness(point_4);
                     weight = 0.0;
                     if (planar) {
-                        float seen = metal::min(_e65 / PSAO_SEEN, 1.0) + PSAO_UNSEEN;
-                        float _e77 = psao_planar_weight(_e4.radius, _e5.normal, d_2, _e64);
-                        weight = (_e41 * seen) * _e77;
+                        float _e70 = psao_seen(_e67);
+                        float _e74 = psao_planar_weight(_e4.radius, _e5.normal, d_2, _e66);
+                        weight = (_e43 * _e70) * _e74;
                     } else {
-                        float _e81 = psao_paper_weight(_e4.radius, _e5.normal, d_2, _e64);
-                        weight = _e81;
+                        float _e78 = psao_paper_weight(_e4.radius, _e5.normal, d_2, _e66);
+                        weight = _e78;
                     }
-                    float _e82 = weights;
+                    float _e79 = weights;
+                    float _e80 = weight;
+                    weights = _e79 + _e80;
+                    float _e82 = sum;
                     float _e83 = weight;
-                    weights = _e82 + _e83;
-                    float _e85 = sum;
-                    float _e86 = weight;
-                    sum = _e85 + (_e86 * _e65);
+                    sum = _e82 + (_e83 * _e67);
                 }
             }
         }
     }
-    float _e95 = weights;
-    if (_e95 > 0.0) {
-        float _e98 = sum;
-        float _e99 = weights;
-        return metal::min(_e98 / _e99, 1.0);
+    float _e92 = weights;
+    if (_e92 > 0.0) {
+        float _e95 = sum;
+        float _e96 = weights;
+        float openness_1 = metal::min(_e95 / _e96, 1.0);
+        float _e100 = psao_seen(openness_1);
+        float seen = planar ? _e100 : 1.0;
+        float _e103 = weights;
+        return metal::float2(openness_1, metal::min(_e103 / (PSAO_NEAR * seen), 1.0));
     }
-    return 1.0;
+    return metal::float2(1.0, 0.0);
 }
 
 float psao_planar(
@@ -399,8 +413,8 @@ float psao_planar(
     device PsaoWords const& psao_buckets,
     device PsaoWords const& psao_cells
 ) {
-    float _e4 = psao_blend(true, instance_3, position_3, normal_5, psao_instances, psao_buckets, psao_cells);
-    return _e4;
+    metal::float2 _e4 = psao_blend(true, instance_3, position_3, normal_5, psao_instances, psao_buckets, psao_cells);
+    return _e4.x;
 }
 
 float psao_paper(
@@ -411,8 +425,8 @@ float psao_paper(
     device PsaoWords const& psao_buckets,
     device PsaoWords const& psao_cells
 ) {
-    float _e4 = psao_blend(false, instance_4, position_4, normal_6, psao_instances, psao_buckets, psao_cells);
-    return _e4;
+    metal::float2 _e4 = psao_blend(false, instance_4, position_4, normal_6, psao_instances, psao_buckets, psao_cells);
+    return _e4.x;
 }
 
 uint psao_tag(
@@ -652,9 +666,9 @@ PsaoPoint psao_point(
     float z_1 = (7.0 - metal::abs(uv_1.x)) - metal::abs(uv_1.y);
     float fold = metal::max(-(z_1), 0.0);
     metal::float3 m = metal::float3(uv_1 - metal::select(metal::float2(fold), metal::float2(-(fold)), uv_1 < metal::float2(0.0)), z_1);
-    float openness = static_cast<float>(static_cast<int>(point_3 & 255u));
-    float seen_1 = metal::min(openness * 0.019607844, 1.0) + PSAO_UNSEEN;
-    return PsaoPoint {static_cast<metal::float3>(steps_1) * scale, m, metal::fma(m.x, m.x, metal::fma(m.y, m.y, m.z * m.z)), openness, (static_cast<int>(point_3) >= 0) ? 0.0 : seen_1};
+    float openness_2 = static_cast<float>(static_cast<int>(point_3 & 255u));
+    float seen_1 = metal::min(openness_2 * 0.019607844, 1.0) + PSAO_UNSEEN;
+    return PsaoPoint {static_cast<metal::float3>(steps_1) * scale, m, metal::fma(m.x, m.x, metal::fma(m.y, m.y, m.z * m.z)), openness_2, (static_cast<int>(point_3) >= 0) ? 0.0 : seen_1};
 }
 
 float psao_dot(
@@ -688,7 +702,7 @@ metal::float2 psao_add(
     return metal::fma(metal::float2(weight_1), metal::float2(1.0, _e6.openness), sums);
 }
 
-float psao_planar_fast(
+metal::float2 psao_blend_fast(
     uint instance_6,
     metal::float3 position_5,
     metal::float3 normal_8,
@@ -703,74 +717,117 @@ float psao_planar_fast(
     PsaoGrid _e3 = psao_grid_fast(instance_6, psao_instances);
     PsaoFragment _e4 = psao_fragment(_e3, position_5, normal_8);
     if (_e4.outside) {
-        return 1.0;
+        return metal::float2(1.0, 0.0);
     }
     metal::uint3 base_2 = static_cast<metal::uint3>(_e4.base);
-    PsaoTable _e9 = psao_table(_e3, base_2);
-    PsaoBlock _e11 = psao_block(_e3, _e9, base_2, true, psao_buckets);
-    block_3 = _e11;
+    PsaoTable _e11 = psao_table(_e3, base_2);
+    PsaoBlock _e13 = psao_block(_e3, _e11, base_2, true, psao_buckets);
+    block_3 = _e13;
     while(true) {
-        uint _e14 = block_3.unsure;
-        if (_e14 != 0u) {
+        uint _e16 = block_3.unsure;
+        if (_e16 != 0u) {
         } else {
             break;
         }
         {
-            uint _e18 = block_3.unsure;
-            uint _e19 = psao_lowest(_e18);
-            metal::uint3 _e20 = psao_corner(_e19);
-            uint _e21 = psao_bucket(_e9, _e20);
-            uint _e22 = psao_key(_e9, _e20);
-            uint _e23 = psao_search(_e21, _e22, psao_buckets, psao_cells);
-            PsaoBlock _e24 = block_3;
-            PsaoBlock _e25 = psao_with(_e24, _e19, _e23);
-            block_3 = _e25;
-            uint _e27 = block_3.unsure;
+            uint _e20 = block_3.unsure;
+            uint _e21 = psao_lowest(_e20);
+            metal::uint3 _e22 = psao_corner(_e21);
+            uint _e23 = psao_bucket(_e11, _e22);
+            uint _e24 = psao_key(_e11, _e22);
+            uint _e25 = psao_search(_e23, _e24, psao_buckets, psao_cells);
+            PsaoBlock _e26 = block_3;
+            PsaoBlock _e27 = psao_with(_e26, _e21, _e25);
+            block_3 = _e27;
             uint _e29 = block_3.unsure;
-            block_3.unsure = _e27 & (_e29 - 1u);
+            uint _e31 = block_3.unsure;
+            block_3.unsure = _e29 & (_e31 - 1u);
         }
     }
-    PsaoBlock _e33 = block_3;
-    uint _e34 = psao_corners(_e33);
-    left = _e34;
+    PsaoBlock _e35 = block_3;
+    uint _e36 = psao_corners(_e35);
+    left = _e36;
     float inverse_radius2_1 = 1.0 / (_e3.radius * _e3.radius);
     while(true) {
-        uint _e46 = left;
-        if (_e46 != 0u) {
+        uint _e48 = left;
+        if (_e48 != 0u) {
         } else {
             break;
         }
         {
-            uint _e49 = left;
-            uint _e50 = psao_lowest(_e49);
-            metal::uint3 _e51 = psao_corner(_e50);
-            PsaoBlock _e52 = block_3;
-            uint _e53 = psao_cell_at(_e52, _e51);
-            uint _e54 = psao_key(_e9, _e51);
-            uint _e55 = round_1;
-            PsaoRound _e56 = psao_round(_e53, _e54, _e55, psao_cells);
-            metal::float3 at = _e4.place - static_cast<metal::float3>(static_cast<metal::int3>(_e51));
-            float _e61 = psao_share(at);
+            uint _e51 = left;
+            uint _e52 = psao_lowest(_e51);
+            metal::uint3 _e53 = psao_corner(_e52);
+            PsaoBlock _e54 = block_3;
+            uint _e55 = psao_cell_at(_e54, _e53);
+            uint _e56 = psao_key(_e11, _e53);
+            uint _e57 = round_1;
+            PsaoRound _e58 = psao_round(_e55, _e56, _e57, psao_cells);
+            metal::float3 at = _e4.place - static_cast<metal::float3>(static_cast<metal::int3>(_e53));
+            float _e63 = psao_share(at);
             metal::float3 place_3 = at - metal::float3(0.015625);
-            metal::float2 _e65 = sums_1;
-            metal::float2 _e69 = psao_add(_e65, inverse_radius2_1, _e4.normal, place_3, _e61, _e56.points[0]);
-            sums_1 = _e69;
-            metal::float2 _e70 = sums_1;
-            metal::float2 _e74 = psao_add(_e70, inverse_radius2_1, _e4.normal, place_3, _e61, _e56.points[1]);
-            sums_1 = _e74;
-            metal::float2 _e75 = sums_1;
-            metal::float2 _e79 = psao_add(_e75, inverse_radius2_1, _e4.normal, place_3, _e61, _e56.points[2]);
-            sums_1 = _e79;
-            uint _e81 = round_1;
-            round_1 = _e56.more ? (_e81 + 1u) : 0u;
-            uint _e86 = left;
-            uint _e87 = left;
-            uint _e91 = left;
-            left = _e56.more ? _e91 : (_e86 & (_e87 - 1u));
+            metal::float2 _e67 = sums_1;
+            metal::float2 _e71 = psao_add(_e67, inverse_radius2_1, _e4.normal, place_3, _e63, _e58.points[0]);
+            sums_1 = _e71;
+            metal::float2 _e72 = sums_1;
+            metal::float2 _e76 = psao_add(_e72, inverse_radius2_1, _e4.normal, place_3, _e63, _e58.points[1]);
+            sums_1 = _e76;
+            metal::float2 _e77 = sums_1;
+            metal::float2 _e81 = psao_add(_e77, inverse_radius2_1, _e4.normal, place_3, _e63, _e58.points[2]);
+            sums_1 = _e81;
+            uint _e83 = round_1;
+            round_1 = _e58.more ? (_e83 + 1u) : 0u;
+            uint _e88 = left;
+            uint _e89 = left;
+            uint _e93 = left;
+            left = _e58.more ? _e93 : (_e88 & (_e89 - 1u));
         }
     }
-    float _e95 = sums_1.y;
-    float _e97 = sums_1.x;
-    float _e104 = sums_1.x;
-    return (_e104 > 0.0) ? metal::min((_e95 / _e97) * 0.003921569, 1.0) : 1.0;
+    float _e97 = sums_1.y;
+    float _e99 = sums_1.x;
+    float openness_3 = metal::min((_e97 / _e99) * 0.003921569, 1.0);
+    float _e106 = sums_1.x;
+    float _e108 = psao_seen(openness_3);
+    float near_1 = metal::min(_e106 / (PSAO_NEAR * _e108), 1.0);
+    float _e118 = sums_1.x;
+    return (_e118 > 0.0) ? metal::float2(openness_3, near_1) : metal::float2(1.0, 0.0);
+}
+
+float psao_planar_fast(
+    uint instance_7,
+    metal::float3 position_6,
+    metal::float3 normal_9,
+    device PsaoWords const& psao_instances,
+    device PsaoWords const& psao_buckets,
+    device PsaoWords const& psao_cells
+) {
+    metal::float2 _e3 = psao_blend_fast(instance_7, position_6, normal_9, psao_instances, psao_buckets, psao_cells);
+    return _e3.x;
+}
+
+float psao_over_baked(
+    uint kernel_,
+    uint instance_8,
+    metal::float3 position_7,
+    metal::float3 normal_10,
+    float baked,
+    float share_1,
+    device PsaoWords const& psao_instances,
+    device PsaoWords const& psao_buckets,
+    device PsaoWords const& psao_cells
+) {
+    metal::float2 found = metal::float2(1.0, 0.0);
+    if (share_1 <= 0.0) {
+        return baked;
+    }
+    if (kernel_ == PSAO_PAPER) {
+        metal::float2 _e15 = psao_blend(false, instance_8, position_7, normal_10, psao_instances, psao_buckets, psao_cells);
+        found = _e15;
+    } else {
+        metal::float2 _e16 = psao_blend_fast(instance_8, position_7, normal_10, psao_instances, psao_buckets, psao_cells);
+        found = _e16;
+    }
+    float _e18 = found.x;
+    float _e20 = found.y;
+    return metal::mix(baked, _e18, _e20 * metal::min(share_1, 1.0));
 }

@@ -99,14 +99,20 @@ impl Atlas {
         })
     }
 
-    /// A picture of the baked texels, one byte each (255 is open), row by row from the top. Texels
-    /// of gutters take the value of the nearest baked one beside them; what is farther is open.
-    pub fn picture(&self, places: &[u32], values: &[f32]) -> Vec<u8> {
+    /// A picture of the baked texels, row by row from the top: the value of each of `places`, in
+    /// their order. Texels of gutters take the mean of the baked ones beside them; what is farther
+    /// is `empty`.
+    pub fn picture(
+        &self,
+        places: &[u32],
+        values: impl Iterator<Item = f32>,
+        empty: f32,
+    ) -> Vec<f32> {
         let size = self.size as usize;
-        let mut picture = vec![255u8; size * size];
+        let mut picture = vec![empty; size * size];
         let mut known = vec![false; size * size];
         for (place, value) in places.iter().zip(values) {
-            picture[*place as usize] = (value.clamp(0.0, 1.0) * 255.0).round() as u8;
+            picture[*place as usize] = value;
             known[*place as usize] = true;
         }
         for _ in 0..GUTTER {
@@ -120,10 +126,12 @@ impl Atlas {
                     (y + 1 < size).then_some(at + size),
                 ];
                 let near = around.into_iter().flatten().filter(|at| known[*at]);
-                let (sum, count) = near.fold((0u32, 0), |(sum, count), at| {
-                    (sum + u32::from(picture[at]), count + 1)
+                let (sum, count) = near.fold((0.0, 0u8), |(sum, count), at| {
+                    (sum + picture[at], count + 1)
                 });
-                grown.extend(sum.checked_div(count).map(|mean| (at, mean as u8)));
+                if count > 0 {
+                    grown.push((at, sum / f32::from(count)));
+                }
             }
             for (at, value) in grown {
                 picture[at] = value;

@@ -1,7 +1,8 @@
 //! `psao bake`: what is baked, into which file, how well and how fast.
 
 use super::atlas::Atlas;
-use super::glb::Document;
+use super::detail::Detail;
+use super::glb::{Document, Textures};
 use super::{
     Baked, DepthMaps, Element, Method, Numbers, Points, REFERENCE_RAYS, Stage, bake, rays,
     rmse_255, sh, texels, vertices,
@@ -9,6 +10,7 @@ use super::{
 use crate::picture::{Picture, write_whole};
 use crate::points::largest_radius;
 use crate::rays::{Hit, Tracer};
+use crate::report::{Form, Plot};
 use crate::scene::{Origins, Scene};
 use crate::world::Progress;
 use clap::{Args, ValueEnum};
@@ -29,8 +31,17 @@ pub struct BakeArgs {
     /// A glTF file (.gltf or .glb)
     #[arg(value_name = "SCENE")]
     pub scene: PathBuf,
+    /// A plain glTF file, in the same place as SCENE: occlusion and normals of SCENE go into its
+    /// textures, and SCENE's own file is not written; with --to texture
+    #[arg(long, value_name = "SCENE")]
+    pub onto: Option<PathBuf>,
+    /// How far from the plain surface the detailed one may be, either way, metres; without it, a
+    /// 50th of the plain scene's radius
+    #[arg(long, value_name = "METRES")]
+    pub cage: Option<f32>,
     /// Where the occlusion goes: vertex attribute _OCCLUSION, occlusion texture, points with
-    /// _OCCLUSION below each node, or spherical harmonics in vertex attributes _TRANSFER_0...
+    /// _OCCLUSION below each node, or spherical harmonics in vertex attributes _TRANSFER_0... or
+    /// in textures
     #[arg(long, value_enum, default_value_t = Target::Vertex)]
     pub to: Target,
     /// How; several, separated by commas, are measured side by side, and the first is written
@@ -49,6 +60,9 @@ pub struct BakeArgs {
     /// Writes what was measured
     #[arg(long, value_name = "FILE")]
     pub json: Option<PathBuf>,
+    /// Writes a plot of the error against the number of directions
+    #[arg(long, value_name = "FILE.svg")]
+    pub plot: Option<PathBuf>,
     /// Metres per unit of the file
     #[arg(long, value_name = "METRES", default_value_t = 1.0)]
     pub unit: f64,
@@ -68,8 +82,9 @@ pub struct BakeArgs {
     /// Texels an edge of a depth map
     #[arg(long, value_name = "TEXELS", default_value_t = 1024)]
     pub resolution: u32,
-    /// Texels of a depth map that elements are lifted off their surface
-    #[arg(long, value_name = "TEXELS", default_value_t = 0.75)]
+    /// How far over an element something must be to hide it, in texels of a depth map; more where
+    /// surfaces slant
+    #[arg(long, value_name = "TEXELS", default_value_t = 0.004)]
     pub bias: f32,
     /// Directions between two read-backs from the GPU; 0 for one read-back at the end
     #[arg(long, value_name = "N", default_value_t = 0)]
@@ -87,6 +102,8 @@ pub enum Target {
     Points,
     /// A transfer vector a vertex
     Sh,
+    /// A transfer vector a texel, over a set of texture coordinates of its own
+    ShTexture,
 }
 
 /// A method by name.
@@ -103,7 +120,7 @@ pub enum MethodArg {
 pub struct Row {
     /// `depth` or `rays`.
     pub method: &'static str,
-    /// `vertex`, `texture`, `points` or `sh`.
+    /// `vertex`, `texture`, `points`, `sh` or `sh-texture`.
     pub target: String,
     /// Places baked.
     pub elements: usize,
@@ -169,6 +186,7 @@ struct Job {
     /// First element of each instance, and behind the last.
     starts: Vec<usize>,
     texture: Option<(Atlas, Vec<u32>)>,
+    detail: Option<Detail>,
     points: Vec<Points>,
 }
 
@@ -178,11 +196,25 @@ struct Job {
 /// What is wrong with the scene or an option, and what to do.
 pub fn run(args: &BakeArgs, progress: Progress<'_>) -> Result<Report, String> {
     check(args)?;
+    let written = args.onto.as_ref().unwrap_or(&args.scene);
     let (scene, origins) =
-        Scene::load_with_origins(&args.scene, args.unit).map_err(|error| error.to_string())?;
-    let mut document = Document::open(&args.scene)?;
+        Scene::load_with_origins(written, args.unit).map_err(|error| error.to_string())?;
+    let mut document = Document::open(written)?;
     let stage = Stage::new(scene);
-    let job = job(args, &stage, &origins, &mut document)?;
+    let mut job = job(args, &stage, &origins, &mut document)?;
+    // What is looked around in: the scene that is written, unless it stands for another.
+    let detailed = args.onto.as_ref().map(|_| -> Result<Stage, String> {
+        let scene = Scene::load(&args.scene, args.unit).map_err(|error| error.to_string())?;
+        Ok(Stage::new(scene))
+    });
+    let detailed = detailed.transpose()?;
+    if let (Some(detailed), Some((atlas, _))) = (&detailed, &job.texture) {
+        let cage_m = args.cage.unwrap_or(stage.sphere().1 / 50.0);
+        let mut detail = Detail::new(&stage, atlas, detailed, cage_m)?;
+        job.elements = std::mem::take(&mut detail.elements);
+        job.detail = Some(detail);
+    }
+    let around = detailed.as_ref().unwrap_or(&stage);
     let count = job.elements.len();
     if count == 0 {
         return Err(format!(
@@ -194,7 +226,7 @@ pub fn run(args: &BakeArgs, progress: Progress<'_>) -> Result<Report, String> {
     let step = count.div_ceil(CHECKED).max(1);
     let checked: Vec<Element> = job.elements.iter().step_by(step).copied().collect();
     let reference = rays::trace(
-        &stage,
+        around,
         &checked,
         Numbers::Openness,
         REFERENCE_RAYS,
@@ -205,7 +237,7 @@ pub fn run(args: &BakeArgs, progress: Progress<'_>) -> Result<Report, String> {
     let target = args.to.to_possible_value();
     let target = target.map_or(String::new(), |value| value.get_name().to_string());
     let mut rows = Vec::new();
-    let mut written = None;
+    let mut values = None;
     for (number, method) in args.method.iter().enumerate() {
         let method = match method {
             MethodArg::Rays => Method::Rays {
@@ -219,7 +251,7 @@ pub fn run(args: &BakeArgs, progress: Progress<'_>) -> Result<Report, String> {
         };
         for directions in &args.directions {
             let baked = bake(
-                &stage,
+                around,
                 &job.elements,
                 job.numbers,
                 method,
@@ -236,14 +268,20 @@ pub fn run(args: &BakeArgs, progress: Progress<'_>) -> Result<Report, String> {
                 readbacks: baked.readbacks,
             });
             if number == 0 {
-                written = Some(baked.values);
+                values = Some(baked.values);
             }
         }
     }
-    let values = written.ok_or("give a --method and a number of --directions")?;
+    let values = values.ok_or("give a --method and a number of --directions")?;
 
     let preview = preview(args, &stage, &job, &values)?;
-    let notes = notes(&stage, &document);
+    let mut notes = notes(&stage, &document);
+    if let Some(missed) = job.detail.as_ref().map(|d| d.missed).filter(|m| *m > 0) {
+        notes.push(format!(
+            "{missed} texels have nothing of the detailed scene within the cage: they show the \
+             plain one"
+        ));
+    }
     let bytes = write(&stage, &origins, document, &job, &values)?;
     let report = Report {
         scene: stage.scene.name.clone(),
@@ -261,9 +299,39 @@ pub fn run(args: &BakeArgs, progress: Progress<'_>) -> Result<Report, String> {
         let bytes = serde_json::to_vec_pretty(&report).map_err(|error| error.to_string())?;
         write_whole(json, &bytes).map_err(text)?;
     }
+    if let Some(path) = &args.plot {
+        let svg = plot(&report).ok_or("--plot: give several numbers of --directions")?;
+        write_whole(path, svg.as_bytes()).map_err(text)?;
+    }
     // Last: where it is, all is well.
     write_whole(&args.out, &bytes).map_err(text)?;
     Ok(report)
+}
+
+/// The error of each method against the number of directions.
+fn plot(report: &Report) -> Option<String> {
+    let mut series: Vec<(String, Vec<(f64, f64)>)> = Vec::new();
+    for row in &report.rows {
+        let point = ((row.directions as f64).log2(), row.rmse_255);
+        match series.iter_mut().find(|(method, _)| method == row.method) {
+            Some((_, points)) => points.push(point),
+            None => series.push((row.method.into(), vec![point])),
+        }
+    }
+    // A picture of its own has no legend: the colours are a plot's first two.
+    let colors = series.iter().zip(["blue", "orange"]);
+    let legend: Vec<String> = colors
+        .map(|((name, _), color)| format!("{color} {name}"))
+        .collect();
+    let plot = Plot {
+        title: format!("{}: error against directions", report.scene),
+        x_label: format!("directions, power of 2 ({})", legend.join(", ")),
+        y_label: "root mean square error, 1/255".into(),
+        series,
+        log_y: true,
+        form: Form::Lines,
+    };
+    plot.svg()
 }
 
 fn check(args: &BakeArgs) -> Result<(), String> {
@@ -289,6 +357,20 @@ fn check(args: &BakeArgs) -> Result<(), String> {
             return Err("--bias must be 0 to 64 texels".into());
         }
     }
+    if args.onto.is_some() && args.to != Target::Texture {
+        return Err(
+            "--onto: a detailed scene goes into a plain one's textures: add --to texture".into(),
+        );
+    }
+    if args.cage.is_some() && args.onto.is_none() {
+        return Err("--cage is for --onto: how far the two scenes are apart".into());
+    }
+    if args
+        .cage
+        .is_some_and(|cage| !(cage > 0.0 && cage.is_finite()))
+    {
+        return Err("--cage must be above 0 metres".into());
+    }
     if args.out.extension().is_none_or(|ending| ending != "glb") {
         return Err(format!(
             "--out {}: its name must end with .glb",
@@ -313,12 +395,13 @@ fn job(
     let instances = 0..stage.scene.instances.len() as u32;
     let mut job = Job {
         numbers: match args.to {
-            Target::Sh => Numbers::Transfer(usize::from(args.order)),
+            Target::Sh | Target::ShTexture => Numbers::Transfer(usize::from(args.order)),
             _ => Numbers::Openness,
         },
         elements: Vec::new(),
         starts: vec![0],
         texture: None,
+        detail: None,
         points: Vec::new(),
     };
     match args.to {
@@ -330,7 +413,7 @@ fn job(
                 job.starts.push(job.elements.len());
             }
         }
-        Target::Texture => {
+        Target::Texture | Target::ShTexture => {
             let mut second = Vec::new();
             for instance in instances {
                 let (node, origin) = source(stage, origins, instance);
@@ -416,8 +499,38 @@ fn write(
     let instances = 0..stage.scene.instances.len() as u32;
     let each = job.numbers.count();
     if let Some((atlas, places)) = &job.texture {
-        let picture = atlas.picture(places, values);
-        let texture = document.add_texture(&grey_png(&picture, atlas.size)?);
+        let mut textures = Textures::default();
+        match job.numbers {
+            Numbers::Openness => {
+                // Occlusion textures are read by their red channel, so that grey will do.
+                let grey = (png::ColorType::Grayscale, png::BitDepth::Eight);
+                let picture = encode_png(atlas, places, grey, &[1.0], |at, _| values[at])?;
+                textures.occlusion = Some(document.add_texture("occlusion", &picture));
+            }
+            Numbers::Transfer(order) => {
+                let width = width_of(each);
+                let color = [png::ColorType::Rgb, png::ColorType::Rgba][width - 3];
+                let form = (color, png::BitDepth::Sixteen);
+                for part in 0..each / width {
+                    // No coefficient is above 1 or below -1.
+                    let value = |at: usize, channel: usize| {
+                        values[at * each + part * width + channel] * 0.5 + 0.5
+                    };
+                    let picture = encode_png(atlas, places, form, &[0.5; 4][..width], value)?;
+                    let name = format!("transfer {part}");
+                    textures
+                        .transfer
+                        .push(document.add_texture(&name, &picture));
+                }
+                textures.order = order;
+            }
+        }
+        if let Some(detail) = &job.detail {
+            let rgb = (png::ColorType::Rgb, png::BitDepth::Eight);
+            let value = |at: usize, axis: usize| detail.normals[at][axis] * 0.5 + 0.5;
+            let picture = encode_png(atlas, places, rgb, &[0.5, 0.5, 1.0], value)?;
+            textures.normal = Some(document.add_texture("normals", &picture));
+        }
         let mut materials = BTreeMap::new();
         for (instance, charts) in instances.zip(&atlas.instances) {
             let (node, origin) = source(stage, origins, instance);
@@ -429,7 +542,18 @@ fn write(
             let triangles = &charts.triangles;
             document.rebuild(node, origin.primitive, &vertices, triangles, set, &uvs)?;
             let primitive = origin.primitive;
-            document.set_occlusion_texture(node, primitive, texture, set, &mut materials)?;
+            if let Some(detail) = &job.detail {
+                // The frame that the normal map is for: viewers must not make their own.
+                let (_, normals) = stage.vertices(instance);
+                let normals: Vec<f32> = (charts.vertices.iter())
+                    .flat_map(|(vertex, _)| normals[*vertex as usize].to_array())
+                    .collect();
+                let tangents = detail.tangents[instance as usize].iter();
+                let tangents: Vec<f32> = tangents.flat_map(|t| t.to_array()).collect();
+                document.set_attribute(node, primitive, "NORMAL", &normals, 3)?;
+                document.set_attribute(node, primitive, "TANGENT", &tangents, 4)?;
+            }
+            document.set_textures(node, primitive, &textures, set, &mut materials)?;
         }
         return document.finish();
     }
@@ -475,7 +599,7 @@ fn write(
                 document.set_attribute(node, origin.primitive, "_OCCLUSION", &sums, 1)?;
             }
             Numbers::Transfer(_) => {
-                let width = if each.is_multiple_of(4) { 4 } else { 3 };
+                let width = width_of(each);
                 for part in 0..each / width {
                     let values: Vec<f32> = (sums.chunks(each))
                         .flat_map(|sums| sums[part * width..][..width].to_vec())
@@ -489,18 +613,46 @@ fn write(
     document.finish()
 }
 
-/// A grey picture of bytes as a PNG. Occlusion textures are read by their red channel, so that
-/// grey will do.
-fn grey_png(picture: &[u8], size: u32) -> Result<Vec<u8>, String> {
+/// Coefficients that are written together.
+fn width_of(coefficients: usize) -> usize {
+    if coefficients.is_multiple_of(4) { 4 } else { 3 }
+}
+
+/// A texture of an atlas as a PNG: `value` says an element's number in a channel, 0 to 1; `empty`
+/// is each channel's where no chart is.
+fn encode_png(
+    atlas: &Atlas,
+    places: &[u32],
+    (color, depth): (png::ColorType, png::BitDepth),
+    empty: &[f32],
+    value: impl Fn(usize, usize) -> f32,
+) -> Result<Vec<u8>, String> {
+    let wide = depth == png::BitDepth::Sixteen;
+    let each = if wide { 2 } else { 1 };
+    let mut texels = vec![0; atlas.size as usize * atlas.size as usize * empty.len() * each];
+    for channel in 0..empty.len() {
+        let values = (0..places.len()).map(|at| value(at, channel));
+        let picture = atlas.picture(places, values, empty[channel]);
+        for (at, number) in picture.into_iter().enumerate() {
+            let number = number.clamp(0.0, 1.0);
+            let start = (at * empty.len() + channel) * each;
+            if wide {
+                let word = ((number * 65535.0).round() as u16).to_be_bytes();
+                texels[start..start + 2].copy_from_slice(&word);
+            } else {
+                texels[start] = (number * 255.0).round() as u8;
+            }
+        }
+    }
     let mut bytes = Vec::new();
-    let mut encoder = png::Encoder::new(&mut bytes, size, size);
-    encoder.set_color(png::ColorType::Grayscale);
-    encoder.set_depth(png::BitDepth::Eight);
+    let mut encoder = png::Encoder::new(&mut bytes, atlas.size, atlas.size);
+    encoder.set_color(color);
+    encoder.set_depth(depth);
     let written = encoder.write_header().and_then(|mut writer| {
-        writer.write_image_data(picture)?;
+        writer.write_image_data(&texels)?;
         writer.finish()
     });
-    written.map_err(|error| format!("the occlusion texture: {error}"))?;
+    written.map_err(|error| format!("the texture: {error}"))?;
     Ok(bytes)
 }
 
@@ -510,6 +662,34 @@ pub fn environment(turn: f32, direction: Vec3) -> f32 {
     let (sin, cos) = turn.sin_cos();
     let sun = Vec3::new(0.75 * cos, 0.66, 0.75 * sin).normalize();
     0.25 + 0.15 * direction.y + 1.4 * (2.0 * (direction.dot(sun) - 1.0)).exp()
+}
+
+/// Which element each texel of an atlas shows.
+struct Texels<'a> {
+    atlas: &'a Atlas,
+    elements: Vec<u32>,
+}
+
+impl Texels<'_> {
+    fn new<'a>(atlas: &'a Atlas, places: &[u32]) -> Texels<'a> {
+        let mut elements = vec![u32::MAX; atlas.size as usize * atlas.size as usize];
+        for (element, place) in (0..).zip(places) {
+            elements[*place as usize] = element;
+        }
+        Texels { atlas, elements }
+    }
+
+    /// The element of the texel at a hit.
+    fn at(&self, hit: Hit) -> Option<usize> {
+        let charts = &self.atlas.instances[hit.instance as usize];
+        let uvs = charts.triangles[hit.triangle as usize]
+            .map(|vertex| charts.vertices[vertex as usize].1);
+        let uv = uvs[0] * (1.0 - hit.u - hit.v) + uvs[1] * hit.u + uvs[2] * hit.v;
+        let edge = self.atlas.size as usize;
+        let texel = |at: f32| ((at * edge as f32) as usize).min(edge - 1);
+        let element = self.elements[texel(uv.y) * edge + texel(uv.x)];
+        (element != u32::MAX).then_some(element as usize)
+    }
 }
 
 /// What was baked, seen from within the scene.
@@ -538,6 +718,10 @@ fn preview(args: &BakeArgs, stage: &Stage, job: &Job, values: &[f32]) -> Result<
         Picture::grey(&grey, &valid, width, height)
     };
     let each = job.numbers.count();
+    let texels = job
+        .texture
+        .as_ref()
+        .map(|(atlas, places)| Texels::new(atlas, places));
     let corners = |hit: Hit| {
         let start = job.starts[hit.instance as usize];
         let triangle = stage.mesh(hit.instance).triangles[hit.triangle as usize];
@@ -549,18 +733,15 @@ fn preview(args: &BakeArgs, stage: &Stage, job: &Job, values: &[f32]) -> Result<
     };
     Ok(match args.to {
         Target::Vertex => picture(&|hit, _| corners(hit).map(|(at, w)| values[at] * w).sum()),
-        Target::Sh => {
+        Target::Sh | Target::ShTexture => {
             let panels: Vec<(String, Picture)> = [0.0f32, 90.0, 180.0, 270.0]
                 .iter()
                 .map(|degrees| {
                     let light = sh::project(|d| environment(degrees.to_radians(), d));
-                    let lit = |hit: Hit, _: Vec3| -> f32 {
-                        corners(hit)
-                            .map(|(at, weight)| {
-                                let transfer = &values[at * each..][..each];
-                                sh::relight(&light, transfer) * weight
-                            })
-                            .sum()
+                    let lit = |at: usize| sh::relight(&light, &values[at * each..][..each]);
+                    let lit = |hit: Hit, _: Vec3| match &texels {
+                        Some(texels) => texels.at(hit).map_or(0.0, lit),
+                        None => corners(hit).map(|(at, weight)| lit(at) * weight).sum(),
                     };
                     (format!("light turned by {degrees}"), picture(&lit))
                 })
@@ -571,21 +752,10 @@ fn preview(args: &BakeArgs, stage: &Stage, job: &Job, values: &[f32]) -> Result<
                 .collect();
             Picture::side_by_side(&panels)
         }
-        Target::Texture => {
-            let Some((atlas, places)) = &job.texture else {
-                return Err("the texture was not made".into());
-            };
-            let texture = atlas.picture(places, values);
-            let edge = atlas.size as usize;
-            picture(&|hit, _| {
-                let charts = &atlas.instances[hit.instance as usize];
-                let uvs = charts.triangles[hit.triangle as usize]
-                    .map(|vertex| charts.vertices[vertex as usize].1);
-                let uv = uvs[0] * (1.0 - hit.u - hit.v) + uvs[1] * hit.u + uvs[2] * hit.v;
-                let texel = |at: f32| ((at * edge as f32) as usize).min(edge - 1);
-                f32::from(texture[texel(uv.y) * edge + texel(uv.x)]) / 255.0
-            })
-        }
+        Target::Texture => picture(&|hit, _| {
+            let texel = texels.as_ref().and_then(|texels| texels.at(hit));
+            texel.map_or(1.0, |at| values[at])
+        }),
         Target::Points => {
             let cell = 4.0 * largest_radius(args.density) as f32;
             let mut grid: HashMap<[i32; 3], Vec<usize>> = HashMap::new();

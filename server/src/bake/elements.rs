@@ -20,7 +20,7 @@ pub struct Element {
 }
 
 /// An instance's surface, as elements are taken from it.
-struct Surface<'a> {
+pub(super) struct Surface<'a> {
     triangles: &'a [[u32; 3]],
     positions: &'a [Vec3],
     normals: &'a [Vec3],
@@ -29,7 +29,7 @@ struct Surface<'a> {
 }
 
 impl<'a> Surface<'a> {
-    fn new(stage: &'a Stage, instance: u32) -> Surface<'a> {
+    pub(super) fn new(stage: &'a Stage, instance: u32) -> Surface<'a> {
         let (positions, normals) = stage.vertices(instance);
         let place = &stage.pose.instances[instance as usize];
         let extent = positions
@@ -44,7 +44,7 @@ impl<'a> Surface<'a> {
         }
     }
 
-    fn element(&self, point: &SurfacePoint) -> Element {
+    pub(super) fn element(&self, point: &SurfacePoint) -> Element {
         let normal = point.normal(self.triangles, self.positions, self.normals);
         let flat = point.geometric_normal(self.triangles, self.positions);
         let normal = self.place.world_normal(normal);
@@ -151,15 +151,36 @@ impl Points {
     }
 }
 
-/// A texel of an atlas: which, and its element.
+/// Texels of an atlas: which, and their elements.
 pub fn texels(stage: &Stage, atlas: &Atlas) -> (Vec<u32>, Vec<Element>) {
+    let instances = 0..stage.scene.instances.len() as u32;
+    let surfaces: Vec<Surface> = instances.map(|i| Surface::new(stage, i)).collect();
+    (covered(atlas).iter())
+        .map(|texel| {
+            let element = surfaces[texel.instance as usize].element(&texel.point);
+            (texel.index, element)
+        })
+        .unzip()
+}
+
+/// A texel of an atlas that has a place on a surface.
+pub(super) struct Texel {
+    /// Its number, row by row from the top.
+    index: u32,
+    /// The instance.
+    pub(super) instance: u32,
+    /// Where on its mesh.
+    pub(super) point: SurfacePoint,
+}
+
+/// All texels of an atlas that have a place, each once.
+pub(super) fn covered(atlas: &Atlas) -> Vec<Texel> {
     let mut owner = vec![false; atlas.size as usize * atlas.size as usize];
-    let (mut places, mut elements) = (Vec::new(), Vec::new());
+    let mut texels = Vec::new();
     // First texels whose middle a triangle covers; then those that it only touches, which are as
     // visible: they take the nearest place on the triangle.
     for touching in [false, true] {
         for (instance, charts) in (0..).zip(&atlas.instances) {
-            let surface = Surface::new(stage, instance);
             for (index, corners) in charts.triangles.iter().enumerate() {
                 let uvs = corners.map(|v| charts.vertices[v as usize].1 * atlas.size as f32);
                 each_texel(uvs, atlas.size, touching, |texel, u, v| {
@@ -170,14 +191,17 @@ pub fn texels(stage: &Stage, atlas: &Atlas) -> (Vec<u32>, Vec<Element>) {
                             v,
                             back: false,
                         };
-                        places.push(texel);
-                        elements.push(surface.element(&point));
+                        texels.push(Texel {
+                            index: texel,
+                            instance,
+                            point,
+                        });
                     }
                 });
             }
         }
     }
-    (places, elements)
+    texels
 }
 
 /// Calls `visit` with each texel whose middle lies in a triangle (corners in texels), and the

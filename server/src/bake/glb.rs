@@ -15,6 +15,19 @@ const POINTS: u64 = 0;
 const ARRAY_BUFFER: u64 = 34962;
 const ELEMENT_ARRAY_BUFFER: u64 = 34963;
 
+/// Textures of a material, by their numbers.
+#[derive(Clone, Debug, Default)]
+pub struct Textures {
+    /// Occlusion.
+    pub occlusion: Option<usize>,
+    /// Normals in tangent space.
+    pub normal: Option<usize>,
+    /// Coefficients of transfer vectors, three or four each, half of one and one half.
+    pub transfer: Vec<usize>,
+    /// Bands of those.
+    pub order: usize,
+}
+
 /// A glTF file that is being added to.
 pub struct Document {
     json: Value,
@@ -406,10 +419,10 @@ impl Document {
     }
 
     /// Adds a PNG as a texture; its index.
-    pub fn add_texture(&mut self, png: &[u8]) -> usize {
+    pub fn add_texture(&mut self, name: &str, png: &[u8]) -> usize {
         let view = self.add_view(png, None, None);
         let image = json!({
-            "name": "occlusion",
+            "name": name,
             "bufferView": view,
             "mimeType": "image/png",
         });
@@ -425,16 +438,17 @@ impl Document {
         self.push("textures", json!({ "source": image, "sampler": sampler }))
     }
 
-    /// Gives a primitive a material that is its own with this occlusion texture, read by texture
-    /// coordinates `set`.
+    /// Gives a primitive a material that is its own with these textures, read by texture
+    /// coordinates `set`. glTF has no place for transfer vectors: they are in its extras, as
+    /// `psaoTransfer`.
     ///
     /// # Errors
     /// There is no such primitive.
-    pub fn set_occlusion_texture(
+    pub fn set_textures(
         &mut self,
         node: usize,
         primitive: usize,
-        texture: usize,
+        textures: &Textures,
         set: usize,
         materials: &mut BTreeMap<(Option<u64>, usize), usize>,
     ) -> Result<(), String> {
@@ -446,7 +460,23 @@ impl Document {
                     Some(old) => self.json["materials"][old as usize].clone(),
                     None => Value::Object(Map::new()),
                 };
-                material["occlusionTexture"] = json!({ "index": texture, "texCoord": set });
+                let info = |texture: usize| json!({ "index": texture, "texCoord": set });
+                if let Some(texture) = textures.occlusion {
+                    material["occlusionTexture"] = info(texture);
+                }
+                if let Some(texture) = textures.normal {
+                    material["normalTexture"] = info(texture);
+                }
+                if !textures.transfer.is_empty() {
+                    if !material["extras"].is_object() {
+                        material["extras"] = json!({});
+                    }
+                    material["extras"]["psaoTransfer"] = json!({
+                        "order": textures.order,
+                        "textures": textures.transfer,
+                        "texCoord": set,
+                    });
+                }
                 let material = self.push("materials", material);
                 materials.insert((old, set), material);
                 material

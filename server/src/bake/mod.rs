@@ -8,6 +8,7 @@
 
 pub mod atlas;
 pub mod command;
+pub mod detail;
 mod elements;
 pub mod glb;
 pub mod rays;
@@ -146,8 +147,8 @@ impl Method {
 pub struct DepthMaps {
     /// Texels an edge.
     pub resolution: u32,
-    /// How many texels an element is lifted off its surface, before it is compared; scaled by the
-    /// sine of the angle to the light.
+    /// How far over an element something must be to hide it, in texels, for a surface that faces
+    /// the light; a slanted one's grows with its slope.
     pub bias: f32,
     /// Directions between two read-backs of the sums; 0 for one read-back in all.
     pub readback_every: usize,

@@ -39,6 +39,7 @@ const BATCH: usize = 16;
 /// Workgroups along one axis that every device has.
 const GROUPS: u32 = 32768;
 const DEPTH: wgpu::TextureFormat = wgpu::TextureFormat::Depth32Float;
+const TILT: wgpu::TextureFormat = wgpu::TextureFormat::Rg16Float;
 
 /// Bakes elements: [`Numbers::count`] values each, and how often sums were read back.
 ///
@@ -57,7 +58,7 @@ pub fn bake(
     }
     let gpu = Gpu::open()?;
     let (middle, radius) = stage.sphere();
-    // A little larger, so that what is lifted stays within the map.
+    // A little larger, so that what lies on it stays within the map.
     let radius = radius * (1.0 + 4.0 / maps.resolution.max(1) as f32);
     let work = Work::new(&gpu, stage, elements, numbers, maps, middle)?;
 
@@ -132,6 +133,7 @@ pub fn bake(
 /// All that a direction's passes read and write.
 struct Work {
     map: wgpu::TextureView,
+    tilts: wgpu::TextureView,
     solid: wgpu::RenderPipeline,
     masked: wgpu::RenderPipeline,
     gather: wgpu::ComputePipeline,
@@ -158,6 +160,8 @@ impl Work {
         let usage = wgpu::TextureUsages::RENDER_ATTACHMENT;
         let map = gpu.texture("depth map", size, 1, DEPTH, usage)?;
         let map = map.create_view(&Default::default());
+        let tilts = gpu.texture("tilts", size, 1, TILT, usage)?;
+        let tilts = tilts.create_view(&Default::default());
         // Elements are counted in f32, and 2^24 is also more than any device sums at once.
         if elements.len() > 1 << 24 {
             return Err(format!(
@@ -203,6 +207,11 @@ impl Work {
             view_dimension: wgpu::TextureViewDimension::D2,
             multisampled: false,
         };
+        let tilt_texture = wgpu::BindingType::Texture {
+            sample_type: wgpu::TextureSampleType::Float { filterable: false },
+            view_dimension: wgpu::TextureViewDimension::D2,
+            multisampled: false,
+        };
         let compute = wgpu::ShaderStages::COMPUTE;
         let element_layout = layout(
             gpu,
@@ -210,6 +219,7 @@ impl Work {
                 (compute, buffer(read, false)),
                 (compute, buffer(write, false)),
                 (compute, depth_texture),
+                (compute, tilt_texture),
             ],
         );
         let shader = gpu.shader("depth maps", include_str!("depth.wgsl"));
@@ -235,8 +245,8 @@ impl Work {
             });
         let groups = (elements.len() as u32).div_ceil(64);
         Ok(Work {
-            solid: pipeline(gpu, &shader, &draw_layout, None),
-            masked: pipeline(gpu, &shader, &draw_layout, Some("masked")),
+            solid: pipeline(gpu, &shader, &draw_layout, "solid"),
+            masked: pipeline(gpu, &shader, &draw_layout, "masked"),
             gather,
             masks: gpu.bind(
                 &mask_layout,
@@ -251,10 +261,12 @@ impl Work {
                     (0, rows.as_entire_binding()),
                     (1, sums.as_entire_binding()),
                     (2, wgpu::BindingResource::TextureView(&map)),
+                    (3, wgpu::BindingResource::TextureView(&tilts)),
                 ],
             ),
             direction,
             map,
+            tilts,
             corners,
             counts,
             sums,
@@ -275,7 +287,15 @@ impl Work {
     fn record(&self, encoder: &mut wgpu::CommandEncoder, direction: &wgpu::BindGroup, at: u32) {
         let mut pass = encoder.begin_render_pass(&wgpu::RenderPassDescriptor {
             label: Some("depth map"),
-            color_attachments: &[],
+            color_attachments: &[Some(wgpu::RenderPassColorAttachment {
+                view: &self.tilts,
+                depth_slice: None,
+                resolve_target: None,
+                ops: wgpu::Operations {
+                    load: wgpu::LoadOp::Clear(wgpu::Color::TRANSPARENT),
+                    store: wgpu::StoreOp::Store,
+                },
+            })],
             depth_stencil_attachment: Some(wgpu::RenderPassDepthStencilAttachment {
                 view: &self.map,
                 depth_ops: Some(wgpu::Operations {
@@ -358,12 +378,12 @@ fn layout(
         })
 }
 
-/// Draws depth alone, of both sides; through a fragment shader where there are holes.
+/// Draws depth and its tilt, of both sides.
 fn pipeline(
     gpu: &Gpu,
     shader: &wgpu::ShaderModule,
     layout: &wgpu::PipelineLayout,
-    holes: Option<&str>,
+    fragment: &str,
 ) -> wgpu::RenderPipeline {
     gpu.device
         .create_render_pipeline(&wgpu::RenderPipelineDescriptor {
@@ -390,11 +410,11 @@ fn pipeline(
                 bias: Default::default(),
             }),
             multisample: Default::default(),
-            fragment: holes.map(|entry| wgpu::FragmentState {
+            fragment: Some(wgpu::FragmentState {
                 module: shader,
-                entry_point: Some(entry),
+                entry_point: Some(fragment),
                 compilation_options: Default::default(),
-                targets: &[],
+                targets: &[Some(TILT.into())],
             }),
             multiview_mask: None,
             cache: None,

@@ -52,9 +52,20 @@ fn corner(
     return out;
 }
 
+// How much depth grows from a texel to the next one, in texels: right and down.
+fn tilt(at: vec4<f32>) -> vec4<f32> {
+    return vec4(vec2(dpdx(at.z), dpdy(at.z)) * direction.size.x, 0.0, 0.0);
+}
+
+@fragment
+fn solid(in: Corner) -> @location(0) vec4<f32> {
+    return tilt(in.clip);
+}
+
 // Holes let light through.
 @fragment
-fn masked(in: Corner) {
+fn masked(in: Corner) -> @location(0) vec4<f32> {
+    let tilted = tilt(in.clip);
     let mask = masks[in.mask - 1u];
     let x = texel_at(in.uv.x, mask.width, mask.wrap_u);
     let y = texel_at(in.uv.y, mask.height, mask.wrap_v);
@@ -63,12 +74,14 @@ fn masked(in: Corner) {
     if f32(value) / 255.0 < mask.cutoff {
         discard;
     }
+    return tilted;
 }
 
 @group(2) @binding(0) var<storage, read> elements: array<Element>;
 // Of each element, the sum of weights and then the sums of what is visible.
 @group(2) @binding(1) var<storage, read_write> sums: array<f32>;
 @group(2) @binding(2) var depth_map: texture_depth_2d;
+@group(2) @binding(3) var tilts: texture_2d<f32>;
 
 @compute @workgroup_size(64)
 fn gather(
@@ -93,19 +106,26 @@ fn gather(
     if slope <= 0.0 {
         return;
     }
-    // A texel holds one depth of a surface that slants through it. Lifted by so many texels, an
-    // element is above that depth at any slant.
-    let radius = direction.toward.w;
+    // A texel holds the depth of what is seen at its middle, and the element is elsewhere in it. So
+    // the two are compared twice: where the texel's middle is, with the element's plane there, and
+    // where the element is, with the plane of what was seen. What hides the element is above it in
+    // both places; its own surface is in none, the one behind an edge not in the first, and that
+    // across a corner not in the second.
     let edge = direction.size.x;
-    let bias = direction.size.y * 2.0 * radius / edge;
-    let lift = bias * sqrt(max(1.0 - slope * slope, 0.0));
-    let at = in_map(element.position.xyz + element.outward.xyz * lift + toward * (0.5 * bias));
-    let texel = vec2<u32>(clamp(
-        vec2(at.x, -at.y) * (0.5 * edge) + 0.5 * edge,
-        vec2(0.0),
-        vec2(edge - 1.0),
-    ));
-    if at.z > textureLoad(depth_map, texel, 0) {
+    let at = in_map(element.position.xyz);
+    let place = vec2(at.x, -at.y) * (0.5 * edge) + 0.5 * edge;
+    let texel = clamp(floor(place), vec2(0.0), vec2(edge - 1.0));
+    let to_middle = texel + 0.5 - place;
+    let across = vec2(dot(element.outward.xyz, direction.right.xyz),
+        -dot(element.outward.xyz, direction.up.xyz));
+    let own_tilt = across / slope;
+    let tilt = textureLoad(tilts, vec2<u32>(texel), 0).xy;
+    // In texels, as tilts are. How far off depths are grows with the tilt: corners are drawn on a
+    // raster of 1/256 texel.
+    let above = (at.z - textureLoad(depth_map, vec2<u32>(texel), 0)) * edge;
+    let there = above + dot(own_tilt, to_middle) - direction.size.y * (1.0 + length(own_tilt));
+    let here = above + dot(tilt, to_middle) - direction.size.y * (1.0 + length(tilt));
+    if there > 0.0 && here > 0.0 {
         return;
     }
     for (var number = 0u; number < numbers; number++) {
