@@ -117,7 +117,15 @@ fn still(points: u32, first: bool) -> Vec<u8> {
     let neighbours = vec![Neighbours::default(); count];
     let target = vec![255; count];
     let mut data = vec![0; 64];
-    let length = encode_slice(&neighbours, FIRST, &mut state, &target, first, &mut data);
+    let length = encode_slice(
+        &neighbours,
+        FIRST,
+        &mut state,
+        &target,
+        &[],
+        first,
+        &mut data,
+    );
     data.truncate(length.unwrap());
     data
 }
