@@ -218,7 +218,7 @@ pub fn run(args: &DemoArgs, progress: Progress<'_>) -> Result<Figures, String> {
             .camera(&said)
             .map_err(|error| error.to_string())?;
         let report = server.frame(&mut transport, time_of(frame), u64::MAX);
-        let row = link.follow(&server, &mut transport, id, &report)?;
+        let row = link.follow(&mut server, &mut transport, id, &report)?;
         figures.mirror_matches &= link.matches(&server, id);
         rows.push(FrameRow {
             time_s: time_of(frame),
@@ -326,7 +326,7 @@ impl Loopback {
     /// Receives what the server has sent until the client is where the server is.
     fn follow(
         &mut self,
-        server: &Server,
+        server: &mut Server,
         transport: &mut Transport,
         id: ClientId,
         report: &FrameReport,

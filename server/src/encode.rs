@@ -7,12 +7,14 @@
 
 mod cells;
 mod residual;
+mod sight;
 
 pub use cells::{NORMAL_THRESHOLD, POSITION_THRESHOLD, RAW_BYTES};
 pub use residual::Limits;
 
 use crate::camera::Camera;
-use crate::world::World;
+use crate::facing::{AWAY, Faces};
+use crate::world::{Slice, World};
 use glam::Vec3;
 use psao::memory::{Heap, SliceHeap};
 use psao_core::mirror::Capacity;
@@ -22,7 +24,11 @@ use psao_core::stream::{
     Writer, flag, kind, write_packet,
 };
 use psao_core::{Bucket, Cell, Instance, Mirror};
+<<<<<<< HEAD
 use std::time::Instant;
+=======
+use rayon::prelude::*;
+>>>>>>> refs/heads/send
 use zstd::zstd_safe::{CCtx, CParameter, Strategy, compress_bound};
 
 /// How a stream carries changes.
@@ -55,6 +61,38 @@ pub struct View<'a> {
     pub sees: &'a (dyn Fn([Vec3; 2]) -> bool + Sync),
     /// From where; `None` until it has said so.
     pub eye: Option<Eye>,
+}
+
+impl View<'_> {
+    /// Those of some blocks of a slice in view that the picture may show ([`World::facing`]).
+    pub fn blocks(&self, world: &World, slice: &Slice, of: u64) -> Faces {
+        let Some(eye) = self.eye else {
+            let Faces { any, all } = Faces::all_of(slice);
+            let (any, all) = (any & of, all & of);
+            return Faces { any, all };
+        };
+        let faces = world.facing(slice, eye.camera.position);
+        let mut any = 0;
+        let mut left = faces.any & of;
+        while left != 0 {
+            let block = left.trailing_zeros();
+            left &= left - 1;
+            let seen = (self.sees)(world.block_bounds(slice, block as usize));
+            any |= u64::from(seen) << block;
+        }
+        let all = faces.all & any;
+        Faces { any, all }
+    }
+
+    /// Whether the picture may show what a point says, if its slice is in sight: it is in view, and
+    /// faces the eye.
+    pub fn needs(&self, world: &World, instance: u32, number: u32) -> bool {
+        self.eye.is_none_or(|eye| {
+            let [at, normal] = world.point_in_world(instance, number);
+            let to = eye.camera.position - at;
+            normal.dot(to) > AWAY * to.length() && (self.sees)([at, at])
+        })
+    }
 }
 
 /// Where a client looks from, and how finely.
@@ -138,7 +176,7 @@ impl Encoder {
             } => {
                 let capacity = capacity_of(world);
                 Sent::Cells(Box::new(cells::Cells::new(
-                    &world.truth,
+                    world,
                     capacity,
                     threshold,
                     compression,
@@ -336,62 +374,56 @@ impl Encoder {
     }
 
     /// Root mean square difference between what a client has and the truth, in 1/255, over the
-    /// points of the slices that `sees` sees. `slices`: the client's, of profile `residual`; there
-    /// slices of which nothing was in sight yet do not count.
+    /// points that its view needs: in view and facing the eye ([`View::needs`]), in slices of which
+    /// something has been in sight so far. In profile `cells`, which makes no such choice, call it after each
+    /// frame. `slices`: the client's, of profile `residual`.
     pub fn point_rmse(
-        &self,
+        &mut self,
         world: &World,
         mirror: &Mirror<Heap>,
         slices: Option<&SliceHeap>,
-        sees: &(dyn Fn([Vec3; 2]) -> bool + Sync),
+        view: &View<'_>,
     ) -> f64 {
-        let (mut sum, mut count) = (0u64, 0u64);
-        // A point the client does not have counts as wholly wrong.
-        let mut add = |want: u8, have: Option<u8>| {
-            let off = have.map_or(255, |have| u64::from(want.abs_diff(have)));
-            sum += off * off;
-            count += 1;
+        let needed = match &mut self.sent {
+            Sent::Cells(sent) => {
+                sent.sight.look(world, view);
+                sent.sight.needed()
+            }
+            Sent::Residual(sent) => sent.needed(),
         };
-        if let Some(slices) = slices {
-            for (index, (slice, open)) in world.slices.iter().zip(slices.get()).enumerate() {
-                let needed = match &self.sent {
-                    Sent::Cells(_) => true,
-                    Sent::Residual(sent) => sent.needs(index),
-                };
-                if needed && sees(slice.bounds) && world.is_present(slice.instance) {
-                    let level = mirror.instances()[slice.instance as usize].level;
-                    let mut have = slices.values(open).iter();
-                    for (want, has) in world.occlusion(slice).iter().zip(world.levels(slice)) {
-                        if u32::from(*has) >= level {
-                            add(*want, have.next().copied());
-                        }
+        let of_slice = |index: &u32| {
+            let slice = &world.slices[*index as usize];
+            let (mut sum, mut count) = (0u64, 0u64);
+            // A point the client does not have counts as wholly wrong.
+            let mut add = |number: u32, have: Option<u8>| {
+                if view.needs(world, slice.instance, number) {
+                    let want = world.occlusion_of(number);
+                    let off = have.map_or(255, |have| u64::from(want.abs_diff(have)));
+                    sum += off * off;
+                    count += 1;
+                }
+            };
+            if let Some(slices) = slices {
+                let level = mirror.instances()[slice.instance as usize].level;
+                let mut have = slices.values(&slices.get()[*index as usize]).iter();
+                for (number, has) in slice.points.clone().zip(world.levels(slice)) {
+                    if u32::from(*has) >= level {
+                        add(number, have.next().copied());
+                    }
+                }
+            } else {
+                for number in slice.points.clone() {
+                    // Those without a cell are in nobody's.
+                    if let Some((cell, at)) = world.place_of(number) {
+                        let have = mirror.cells()[cell as usize].points[at];
+                        add(number, have.is_allocated().then(|| have.occlusion()));
                     }
                 }
             }
-            return (sum as f64 / count.max(1) as f64).sqrt();
-        }
-        let mut add_cell = |cell: usize| {
-            let (want, have) = (&world.truth.cells[cell], &mirror.cells()[cell]);
-            for (want, have) in want.points.iter().zip(&have.points) {
-                if want.is_allocated() {
-                    add(
-                        want.occlusion(),
-                        have.is_allocated().then(|| have.occlusion()),
-                    );
-                }
-            }
+            (sum, count)
         };
-        let mut seen_instance = vec![false; world.truth.instances.len()];
-        for slice in world.slices.iter().filter(|slice| sees(slice.bounds)) {
-            seen_instance[slice.instance as usize] = true;
-            slice.cells.clone().for_each(|cell| add_cell(cell as usize));
-        }
-        for cell in world.loose_cells as usize..world.truth.cells.len() {
-            let home = world.truth.home(cell as u32);
-            if seen_instance[world.instance_of_bucket(home) as usize] {
-                add_cell(cell);
-            }
-        }
+        let add = |a: (u64, u64), b: (u64, u64)| (a.0 + b.0, a.1 + b.1);
+        let (sum, count) = needed.par_iter().map(of_slice).reduce(|| (0, 0), add);
         (sum as f64 / count.max(1) as f64).sqrt()
     }
 

@@ -543,6 +543,8 @@ impl Stream {
                 *before = *now;
             }
         }
+        let slices = matches!(self.scheme, Scheme::Residual(..)).then(|| self.client.slices());
+        let rmse_255 = self.encoder.point_rmse(world, mine, slices, sight);
         self.frames.push(StreamFrame {
             bytes: self.bytes.len(),
             slices_bytes: packets_bytes(&self.bytes, kind::SLICES)?,
@@ -550,9 +552,7 @@ impl Stream {
             encode_ms,
             select_ms: both_ms - encode_ms,
             decode_ms,
-            rmse_255: self
-                .encoder
-                .point_rmse(world, mine, self.encoder.slices(), sight.sees),
+            rmse_255,
             points,
         });
         self.client.clear_dirty();

@@ -9,6 +9,7 @@ pub mod commands;
 pub mod demo;
 pub mod encode;
 pub mod eval;
+pub mod facing;
 #[cfg(feature = "gpu")]
 pub mod gpu;
 pub mod identity;

@@ -309,13 +309,17 @@ impl Server {
     }
 
     /// [`Encoder::point_rmse`] of what a client has, over what that client sees.
-    pub fn point_rmse(&self, id: ClientId, client: &psao::Client) -> Option<f64> {
-        let viewer = self.viewers.get(&id)?;
+    pub fn point_rmse(&mut self, id: ClientId, client: &psao::Client) -> Option<f64> {
+        let viewer = self.viewers.get_mut(&id)?;
         let residual = matches!(self.settings.scheme, Scheme::Residual(..));
         let slices = residual.then(|| client.slices());
-        let sees = |bounds: [Vec3; 2]| viewer.sees(bounds);
-        let encoder = &viewer.encoder;
-        Some(encoder.point_rmse(&self.world, client.mirror(), slices, &sees))
+        let frustum = viewer.frustum.clone();
+        let view = View {
+            sees: &|bounds| sees(&frustum, bounds),
+            eye: viewer.eye,
+        };
+        let encoder = &mut viewer.encoder;
+        Some(encoder.point_rmse(&self.world, client.mirror(), slices, &view))
     }
 }
 

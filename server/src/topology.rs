@@ -388,7 +388,7 @@ impl Topology {
 
     /// The set of an instance, if it has points.
     pub fn set_of(&self, instance: u32) -> Option<&PointSet> {
-        let (set, _) = self.of_instance[instance as usize]?;
+        let (set, _) = (*self.of_instance.get(instance as usize)?)?;
         Some(&self.sets[set as usize])
     }
 }

@@ -24,7 +24,8 @@ impl Place {
         (self != Place::NONE).then_some(self.0 >> 3)
     }
 
-    fn slot(self) -> usize {
+    /// Its place in the cell.
+    pub fn slot(self) -> usize {
         self.0 as usize & 7
     }
 }

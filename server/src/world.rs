@@ -5,6 +5,7 @@
 //! against geometry that a point is rigidly attached to are traced once and kept as bits; the
 //! others again only when something moved within their reach.
 
+use crate::facing::{Cone, Faces, LocalEye};
 use crate::points::pilot::{Density, PILOT_RAYS, Pilot, densities};
 use crate::points::{
     PointError, SurfacePoint, generate, generate_adaptive, largest_radius, morton_order,
@@ -140,6 +141,9 @@ pub const MAX_POINTS: u64 = 1 << 26;
 /// Most steps in which points may take turns ([`Options::refresh_steps`]).
 pub const MAX_REFRESH_STEPS: u32 = 8;
 
+/// A set of a slice's points, the first in the lowest bit of the first word.
+pub type PointBits = [u64; SLICE_POINTS / 64];
+
 /// A run of points of one instance in Morton order.
 #[derive(Clone, Debug)]
 pub struct Slice {
@@ -219,9 +223,12 @@ pub struct World {
     /// In rest space, the highest level of detail that has a point.
     levels: Vec<u8>,
     occlusion: Vec<u8>,
-    /// In rest space, slices in which a point's occlusion has changed since
+    /// In rest space, of each slice the blocks in which a point's occlusion has changed since
     /// [`World::clear_changes`].
-    changed: Vec<bool>,
+    changed: Vec<u64>,
+    /// In rest space, which way each instance's points face, block by block, in local space: a
+    /// slice's at [`SLICE_BLOCKS`] times its patch's number in its set.
+    cones: Vec<Arc<Vec<Cone>>>,
     openness: Vec<Option<Openness>>,
     /// Rays against what each point is attached to: bits of those that hit.
     fixed: Vec<u64>,
@@ -290,6 +297,7 @@ impl World {
             levels: Vec::new(),
             occlusion: Vec::new(),
             changed: Vec::new(),
+            cones: Vec::new(),
             openness: Vec::new(),
             topology: Topology::default(),
             fixed: Vec::new(),
@@ -368,7 +376,8 @@ impl World {
         for instance in 0..self.scene.instances.len() as u32 {
             self.add_patches(instance);
         }
-        self.changed = vec![true; self.slices.len()];
+        self.changed = vec![u64::MAX; self.slices.len()];
+        self.cones = self.all_cones();
         let of_instance = &self.topology.of_instance;
         let mut adjacent: BTreeMap<(u32, u32), Arc<Adjacency>> = BTreeMap::new();
         for key in of_instance.iter().flatten() {
@@ -688,6 +697,9 @@ impl World {
                     self.slices[slice as usize].bounds = self.slice_bounds(slice as usize);
                 }
             }
+            if bent && self.scene.instances[instance].deforms && self.options.rest_space {
+                self.cones[instance] = Arc::new(self.cones_of(instance as u32));
+            }
         }
         let reach = self.options.ao_distance_m;
         for slice in &mut self.slices {
@@ -885,7 +897,7 @@ impl World {
             let slice = &mut self.slices[index];
             slice.rays_done = rays;
             slice.stale = false;
-            let mut changed = false;
+            let (mut changed, first) = (0u64, slice.points.start as usize);
             for (point, &occlusion) in slice.points.clone().zip(&mut occlusion) {
                 let point = point as usize;
                 if self.occlusion[point] != occlusion {
@@ -893,11 +905,11 @@ impl World {
                     if let Some(place) = self.places.get(point) {
                         self.truth.set_occlusion(*place, occlusion);
                     }
-                    changed = true;
+                    changed |= 1 << ((point - first) / BLOCK);
                 }
             }
-            if changed && self.options.rest_space {
-                self.note_change(index);
+            if changed != 0 && self.options.rest_space {
+                self.note_change(index, changed);
             }
         }
         (self.fixed, self.traced) = (fixed, traced);
@@ -1065,6 +1077,31 @@ impl World {
         )
     }
 
+    /// A point's position (metres from the scene's origin) and unit normal in the world now.
+    pub fn point_in_world(&self, instance: u32, number: u32) -> [Vec3; 2] {
+        let (positions, normals) = self.vertices(instance);
+        let point = &self.points[number as usize];
+        let triangles = &self.mesh(instance).triangles;
+        let pose = &self.pose.instances[instance as usize];
+        [
+            pose.world_from_local
+                .transform_point3(point.position(triangles, positions)),
+            pose.world_normal(point.normal(triangles, positions, normals)),
+        ]
+    }
+
+    /// What a point says: 255 is open, 0 fully occluded.
+    pub fn occlusion_of(&self, number: u32) -> u8 {
+        self.occlusion[number as usize]
+    }
+
+    /// Where a point is in the truth's cells: its cell, and its place there. `None` in rest space,
+    /// and where there is no room for it.
+    pub fn place_of(&self, number: u32) -> Option<(u32, usize)> {
+        let place = self.places.get(number as usize)?;
+        place.cell().map(|cell| (cell, place.slot()))
+    }
+
     /// In rest space: the level of detail that an instance's scale asks for, if it has points.
     pub fn level_of(&self, instance: u32) -> Option<u32> {
         self.topology.of_instance[instance as usize].map(|(_, level)| level)
@@ -1133,14 +1170,113 @@ impl World {
         carrier.map_or(0..0, |carrier| carrier.slices.clone())
     }
 
-    /// In rest space: whether a slice's occlusion has changed since [`World::clear_changes`].
-    pub fn has_changed(&self, slice: usize) -> bool {
-        self.changed[slice]
+    /// In rest space: the blocks of each slice (of [`BLOCK`] points, the first in the lowest bit)
+    /// that have changed since [`World::clear_changes`]: in what they say, or in whether a client
+    /// needs them ([`World::shown`]).
+    pub fn changed(&self) -> &[u64] {
+        &self.changed
     }
 
-    /// Starts a new frame for [`World::has_changed`] and [`Truth::changes`].
+    /// In rest space: the blocks of a slice that may face an eye (in the world, metres from the
+    /// scene's origin), or soon one near it. What is in the others shows in no picture from there.
+    pub fn facing(&self, slice: &Slice, eye: Vec3) -> Faces {
+        match (self.local_eye(slice.instance, eye), self.cones_at(slice)) {
+            (Some(eye), Some(cones)) => eye.faces(cones),
+            _ => Faces::all_of(slice),
+        }
+    }
+
+    /// The same of a slice's points one by one, those of `blocks`: a set, the first in the lowest
+    /// bit of the first word.
+    pub fn points_facing(&self, slice: &Slice, eye: Vec3, blocks: u64) -> PointBits {
+        let mut facing = [u64::MAX; SLICE_POINTS / 64];
+        let Some(eye) = self.local_eye(slice.instance, eye) else {
+            return facing;
+        };
+        let (positions, normals) = self.vertices(slice.instance);
+        let triangles = &self.mesh(slice.instance).triangles;
+        let points = slice.points.start as usize..slice.points.end as usize;
+        for (block, points) in self.points[points].chunks(BLOCK).enumerate() {
+            if blocks >> block & 1 == 0 {
+                continue;
+            }
+            for (at, point) in (block * BLOCK..).zip(points) {
+                let (position, sides) = sides(point, triangles, positions, normals);
+                if !sides.iter().any(|side| eye.is_faced(position, *side)) {
+                    facing[at / 64] &= !(1 << (at % 64));
+                }
+            }
+        }
+        facing
+    }
+
+    /// In rest space: bounds in the world of a block of a slice, with a cell's margin.
+    pub fn block_bounds(&self, slice: &Slice, block: usize) -> [Vec3; 2] {
+        let Some(cones) = self.cones_at(slice) else {
+            return slice.bounds;
+        };
+        let (center, radius) = cones[block].ball();
+        let world = &self.pose.instances[slice.instance as usize].world_from_local;
+        let [min, max] = placed_bounds(world, [center - radius, center + radius]);
+        let margin = self.options.cell_m();
+        [min - margin, max + margin]
+    }
+
+    fn local_eye(&self, instance: u32, eye: Vec3) -> Option<LocalEye> {
+        LocalEye::of(
+            eye,
+            &self.pose.instances[instance as usize].world_from_local,
+        )
+    }
+
+    /// A slice's part of [`World::cones`].
+    fn cones_at(&self, slice: &Slice) -> Option<&[Cone]> {
+        let cones = self.cones.get(slice.instance as usize)?;
+        let (set, _) = self.topology.of_instance[slice.instance as usize]?;
+        let patch = slice.patch - self.topology.first_patch[set as usize];
+        let first = patch as usize * SLICE_BLOCKS;
+        cones.get(first..first + slice.points.len().div_ceil(BLOCK))
+    }
+
+    /// What [`World::facing`] asks, in the present pose; one for all instances that do not deform
+    /// and have the same points.
+    fn all_cones(&self) -> Vec<Arc<Vec<Cone>>> {
+        let mut shared: BTreeMap<(u32, u32), Arc<Vec<Cone>>> = BTreeMap::new();
+        let of_instance = self.topology.of_instance.iter().zip(0..);
+        of_instance
+            .map(|(key, instance)| {
+                let Some(key) = *key else {
+                    return Arc::default();
+                };
+                if self.scene.instances[instance as usize].deforms {
+                    return Arc::new(self.cones_of(instance));
+                }
+                let made = || Arc::new(self.cones_of(instance));
+                Arc::clone(shared.entry(key).or_insert_with(made))
+            })
+            .collect()
+    }
+
+    fn cones_of(&self, instance: u32) -> Vec<Cone> {
+        let (positions, normals) = self.vertices(instance);
+        let triangles = &self.mesh(instance).triangles;
+        let slices = self.slices_of(instance);
+        let slices = self.slices[slices.start as usize..slices.end as usize].par_iter();
+        slices
+            .flat_map_iter(|slice| {
+                let points = slice.points.start as usize..slice.points.end as usize;
+                let points = self.points[points].iter();
+                let points = points.map(|p| sides(p, triangles, positions, normals));
+                let mut cones = Cone::of_blocks(points);
+                cones.resize(SLICE_BLOCKS, Cone::default());
+                cones
+            })
+            .collect()
+    }
+
+    /// Starts a new frame for [`World::changed`] and [`Truth::changes`].
     pub fn clear_changes(&mut self) {
-        self.changed.fill(false);
+        self.changed.fill(0);
         self.truth.clear_changes();
     }
 
@@ -1159,8 +1295,8 @@ impl World {
             .fold(0, |shown, &dark| shown << 1 | u64::from(dark > 0))
     }
 
-    fn note_change(&mut self, index: usize) {
-        self.changed[index] = true;
+    fn note_change(&mut self, index: usize, blocks: u64) {
+        self.changed[index] |= blocks;
         let slice = &self.slices[index];
         let set = self.topology.of_instance[slice.instance as usize].map_or(0, |(set, _)| set);
         let patch = slice.patch - self.topology.first_patch[set as usize];
@@ -1176,8 +1312,9 @@ impl World {
         // What comes into or goes out of cells nearby is a change of those slices too.
         let carrier = self.carriers[slice.instance as usize].as_ref();
         let first_slice = carrier.map_or(0, |carrier| carrier.slices.start as usize);
-        for patch in openness.turned.drain(..) {
-            self.changed[first_slice + patch as usize] = true;
+        for block in openness.turned.drain(..) {
+            let (patch, block) = (block / SLICE_BLOCKS as u32, block % SLICE_BLOCKS as u32);
+            self.changed[first_slice + patch as usize] |= 1 << block;
         }
     }
 
@@ -1232,6 +1369,21 @@ impl World {
     }
 }
 
+/// A point's position, and unit normals that must all face away before the point does: its own, and
+/// that of its flat triangle where the two have little to do with each other. (Some models have
+/// normals that point inwards; and it is the triangle that is drawn or not.)
+fn sides(
+    point: &SurfacePoint,
+    triangles: &[[u32; 3]],
+    positions: &[Vec3],
+    normals: &[Vec3],
+) -> (Vec3, [Vec3; 2]) {
+    let normal = point.normal(triangles, positions, normals);
+    let flat = point.geometric_normal(triangles, positions);
+    let other = if flat.dot(normal) < 0.5 { flat } else { normal };
+    (point.position(triangles, positions), [normal, other])
+}
+
 /// A point as open as this, with all around it so too, need not be at the client.
 const OPEN: u8 = 250;
 
@@ -1242,7 +1394,7 @@ struct Openness {
     dark: Vec<bool>,
     /// How many dark blocks are near each, itself counted.
     near_dark: Vec<u16>,
-    /// Patches with blocks that came near a dark one, or no longer are.
+    /// Blocks that came near a dark one, or no longer are.
     turned: Vec<u32>,
 }
 
@@ -1268,9 +1420,8 @@ impl Openness {
             let count = &mut self.near_dark[near as usize];
             let before = *count > 0;
             *count = if dark { *count + 1 } else { *count - 1 };
-            let patch = near / SLICE_BLOCKS as u32;
-            if before != (*count > 0) && self.turned.last() != Some(&patch) {
-                self.turned.push(patch);
+            if before != (*count > 0) {
+                self.turned.push(near);
             }
         }
     }

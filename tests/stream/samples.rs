@@ -458,7 +458,15 @@ impl Coded {
         let (neighbours, mut state) = slices.side(&slice).unwrap();
         let target: Vec<u8> = (0..slice.point_count as usize).map(target).collect();
         let mut data = vec![0; MAX_SLICE_BYTES];
-        let length = encode_slice(neighbours, quantiser, &mut state, &target, opens, &mut data);
+        let length = encode_slice(
+            neighbours,
+            quantiser,
+            &mut state,
+            &target,
+            &[],
+            opens,
+            &mut data,
+        );
         data.truncate(length.unwrap());
         slices.settle(&mut self.mirror, index, shown).unwrap();
         (index, operation, slice.point_count, data)

@@ -3,9 +3,12 @@
 use crate::samples::{NO_LIMITS, QUANTISER, config, contents, left_out, scene, values};
 use glam::Vec3;
 use psao::core::mirror::Capacity;
+use psao::core::residual::BLOCK;
 use psao::core::stream::{MAX_BODY_BYTES, Packet};
 use psao::{Client, State};
+use psao_server::camera::Camera;
 use psao_server::encode::{Encoder, Eye, FrameStats, Limits, Scheme, View, capacity_of};
+use psao_server::facing::{AWAY, Faces};
 use psao_server::scene::{LocalTransform, Scene};
 use psao_server::world::{Options, World};
 
@@ -80,28 +83,10 @@ impl Watched {
         sent
     }
 
-    /// How far off the points of slices in view are at most, in 1/255, by the slices' values; those
+    /// How far off the points that the view needs are at most, in 1/255, by the slices' values; those
     /// of slices that are not open say 255.
     fn error(&self, view: &View<'_>) -> u8 {
-        let slices = self.client.slices();
-        let mut most = 0;
-        for (slice, open) in self.world.slices.iter().zip(slices.get()) {
-            if !(view.sees)(slice.bounds) {
-                continue;
-            }
-            let level = self.client.mirror().instances()[slice.instance as usize].level;
-            let want = self
-                .world
-                .occlusion(slice)
-                .iter()
-                .zip(self.world.levels(slice));
-            let want = want.filter(|(_, has)| u32::from(**has) >= level);
-            let mut have = slices.values(open).iter();
-            for (want, _) in want {
-                most = most.max(want.abs_diff(have.next().copied().unwrap_or(255)));
-            }
-        }
-        most
+        errors(&self.world, &self.client, view)[0]
     }
 
     /// What the client shows at all points of the scene.
@@ -117,6 +102,46 @@ impl Watched {
                 lookup.blend(kernel, instance, position, normal).openness
             })
             .collect()
+    }
+}
+
+/// How far off a client's points are at most: those in view that may show, and the others.
+fn errors(world: &World, client: &Client, view: &View<'_>) -> [u8; 2] {
+    let slices = client.slices();
+    let mut most = [0; 2];
+    for (slice, open) in world.slices.iter().zip(slices.get()) {
+        if !(view.sees)(slice.bounds) {
+            continue;
+        }
+        let level = client.mirror().instances()[slice.instance as usize].level;
+        let mut have = slices.values(open).iter();
+        let points = world.occlusion(slice).iter().zip(world.levels(slice));
+        for (number, (want, has)) in slice.points.clone().zip(points) {
+            if u32::from(*has) >= level {
+                let most = &mut most[usize::from(!view.needs(world, slice.instance, number))];
+                *most = want
+                    .abs_diff(have.next().copied().unwrap_or(255))
+                    .max(*most);
+            }
+        }
+    }
+    most
+}
+
+/// Looks at the middle of the scene from a height; a negative one is below the floor.
+fn from_height(height: f32) -> View<'static> {
+    let camera = Camera {
+        position: Vec3::Y * height,
+        forward: Vec3::NEG_Y * height,
+        up: Vec3::Z,
+        fov_y_rad: 1.0,
+        aspect: 1.0,
+        near: 0.1,
+        far: 100.0,
+    };
+    View {
+        sees: &all,
+        eye: Some(Eye::of(&camera, 1000)),
     }
 }
 
@@ -136,6 +161,91 @@ fn a_still_scene_sends_no_bytes_once_it_has_converged() {
     let last = sent.iter().rposition(|bytes| *bytes > 0).unwrap();
     assert!((1..30).contains(&last), "{sent:?}");
     assert!(watched.error(&EVERYTHING) <= QUANTISER.bound());
+}
+
+#[test]
+fn what_faces_away_is_not_sent_until_the_camera_comes_round_and_then_in_one_frame() {
+    let mut watched = Watched::new(scene(), 800.0, NO_LIMITS);
+    let (above, below) = (from_height(3.0), from_height(-3.0));
+    watched.frame(0.0, &EVERYTHING);
+    let mut bytes = [0, 0];
+    for frame in 1..30 {
+        let time_s = f64::from(frame) * 0.03;
+        let view = if frame < 15 { &above } else { &below };
+        bytes[usize::from(frame < 15)] += watched.frame(time_s, view).bytes;
+        let [shows, hidden] = errors(&watched.world, &watched.client, view);
+        assert!(shows <= QUANTISER.bound(), "frame {frame}: {shows}");
+        // What the box casts its shadow on turns its back to the camera below.
+        assert!(frame < 20 || hidden > 20, "frame {frame}: {hidden}");
+    }
+    assert!(bytes[1] > 0 && bytes[0] > 0, "{bytes:?}");
+    // What is left as it is costs nothing once all else stands still.
+    watched.frame(0.87, &below);
+    let sent = watched.frame(0.87, &below);
+    assert_eq!(sent, FrameStats::default());
+    assert!(errors(&watched.world, &watched.client, &below)[1] > 20);
+    let sent = watched.frame(0.87, &above);
+    assert!(watched.error(&above) <= QUANTISER.bound() && sent.bytes > 0);
+}
+
+#[test]
+fn clients_that_look_from_two_sides_get_each_what_it_sees_of_the_same_slices() {
+    let mut watched = Watched::new(scene(), 800.0, NO_LIMITS);
+    let world = &mut watched.world;
+    let scheme = Scheme::Residual(QUANTISER, NO_LIMITS);
+    let views = [from_height(3.0), from_height(-3.0)];
+    let mut clients = [0, 1].map(|_| {
+        let encoder = Encoder::new(world, scheme, 0);
+        (encoder, Client::new(config(capacity_of(world))))
+    });
+    for frame in 0..20 {
+        world.step(frame as f64 * 0.04, &all, u64::MAX);
+        for ((encoder, client), view) in clients.iter_mut().zip(&views) {
+            encoder.merge(world);
+            let mut bytes = match frame {
+                0 => encoder.header(world, 0, 30.0),
+                _ => Vec::new(),
+            };
+            let first = if frame == 0 { &EVERYTHING } else { view };
+            encoder.frame(world, frame, first, true, &mut bytes);
+            let mut rest = &bytes[..];
+            while !rest.is_empty() {
+                rest = &rest[client.push(rest).unwrap().consumed..];
+            }
+            let [shows, _] = errors(world, client, view);
+            assert!(shows <= QUANTISER.bound(), "frame {frame}: {shows}");
+        }
+        world.clear_changes();
+    }
+    let [left, right] = clients
+        .each_ref()
+        .map(|(_, client)| values(client.slices()));
+    assert!(left != right, "neither lacks what the other has");
+}
+
+#[test]
+fn no_point_that_faces_the_eye_is_in_a_block_that_does_not_whatever_moves_and_bends() {
+    let mut watched = Watched::new(scene(), 800.0, NO_LIMITS);
+    let world = &mut watched.world;
+    let (mut facing, mut left) = (0, 0);
+    for step in 0..12 {
+        let angle = f32::from(step as u8);
+        let eye = Vec3::new(angle.sin(), angle.cos(), (angle * 1.7).sin()) * 1.5;
+        world.step(f64::from(step) * 0.08, &all, 0);
+        for slice in &world.slices {
+            let Faces { any, all } = world.facing(slice, eye);
+            for (at, number) in slice.points.clone().enumerate() {
+                let [position, normal] = world.point_in_world(slice.instance, number);
+                let faces = normal.dot((eye - position).normalize()) > 0.0;
+                let [left_out, kept] = [any, all].map(|blocks| blocks >> (at / BLOCK) & 1 == 0);
+                assert!(!(faces && left_out), "step {step}, point {number}");
+                let away = normal.dot((eye - position).normalize()) < AWAY - 0.01;
+                assert!(!away || kept, "step {step}, point {number}");
+                (facing, left) = (facing + u32::from(faces), left + u32::from(left_out));
+            }
+        }
+    }
+    assert!(left * 20 > facing, "{left} left out, {facing} face the eye");
 }
 
 #[test]
@@ -336,7 +446,7 @@ fn levels_of_detail_change_with_the_distance_and_fade() {
         let view = View {
             sees: &all,
             eye: Some(Eye {
-                camera: psao_server::camera::Camera {
+                camera: Camera {
                     position: Vec3::new(0.0, far, 0.0),
                     forward: Vec3::NEG_Y,
                     up: Vec3::Z,

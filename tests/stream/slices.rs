@@ -130,6 +130,7 @@ fn still(points: u32, first: bool) -> Vec<u8> {
         quantiser,
         &mut state,
         &target,
+        &[],
         first,
         &mut data,
     );

@@ -199,7 +199,9 @@ pub struct Quantiser {
     /// Residuals are multiples of this many 1/255; 0 counts as 1. 1 is lossless together with
     /// `dead_zone` 0.
     pub step: u8,
-    /// A point that is off by no more than this many 1/255 is left as it is.
+    /// A point that is off by no more than this many 1/255 is left as it is. One that is to be 0
+    /// becomes 0 all the same: the lookup all but leaves out points that are wholly occluded (those
+    /// within something else), and no longer does where they are a little above.
     pub dead_zone: u8,
 }
 
@@ -208,6 +210,11 @@ impl Quantiser {
     pub fn bound(self) -> u8 {
         self.dead_zone.max(self.step / 2)
     }
+
+    /// Whether a point that says `value` is near enough to `target` to be left as it is.
+    pub fn leaves(self, value: u8, target: u8) -> bool {
+        value == target || target != 0 && value.abs_diff(target) <= self.dead_zone
+    }
 }
 
 /// Codes a slice that the client has in this state, so that it gets near `target`, and brings the
@@ -215,7 +222,9 @@ impl Quantiser {
 /// state is taken for open and still, whatever it says. Returns the number of bytes.
 ///
 /// `neighbours`, the state and `target` have the same length, at most [`SLICE_POINTS`]; what is
-/// longer than the shortest is left alone.
+/// longer than the shortest is left alone. `free`: a set of points, the first in the lowest bit of
+/// the first word, that may say anything: they take what costs least. Those beyond its end are not
+/// in it.
 ///
 /// # Errors
 /// `out` has no room: [`MAX_SLICE_BYTES`] are always enough. The state is then worthless.
@@ -224,14 +233,15 @@ pub fn encode_slice(
     quantiser: Quantiser,
     state: &mut SliceState<'_>,
     target: &[u8],
+    free: &[u64],
     first: bool,
     out: &mut [u8],
 ) -> Result<usize, Full> {
     let mut side = Encode {
         coder: Encoder::new(out),
         target,
-        step: i32::from(quantiser.step.max(1)),
-        dead_zone: quantiser.dead_zone,
+        free,
+        quantiser,
     };
     code_slice(&mut side, neighbours, quantiser.step, state, first);
     side.coder.finish()
@@ -274,8 +284,16 @@ trait Side {
 struct Encode<'a> {
     coder: Encoder<'a>,
     target: &'a [u8],
-    step: i32,
-    dead_zone: u8,
+    free: &'a [u64],
+    quantiser: Quantiser,
+}
+
+impl Encode<'_> {
+    /// The points from `first` on, up to the next multiple of 64, that may say anything.
+    fn free(&self, first: usize) -> u64 {
+        let word = self.free.get(first >> 6).copied().unwrap_or_default();
+        word >> (first & 63)
+    }
 }
 
 impl Side for Encode<'_> {
@@ -305,29 +323,46 @@ impl Side for Encode<'_> {
 
     fn moved(&self, first: usize, values: &[u8]) -> bool {
         let target = self.target.get(first..).unwrap_or_default();
-        let most = |target: &[u8], values: &[u8]| {
-            let off = target.iter().zip(values).map(|(t, v)| t.abs_diff(*v));
-            off.fold(0, u8::max)
+        let moved = |target: &[u8], values: &[u8]| {
+            let pairs = target.iter().zip(values);
+            pairs.fold(false, |moved, (t, v)| {
+                moved | !self.quantiser.leaves(*v, *t)
+            })
         };
-        let most = match (target.first_chunk::<BLOCK>(), values.first_chunk::<BLOCK>()) {
-            (Some(target), Some(values)) => most(target, values),
-            _ => most(target, values),
-        };
-        most > self.dead_zone
+        let free = self.free(first);
+        if free != 0 {
+            let pairs = target.iter().zip(values).enumerate();
+            let mut needed = pairs.filter(|(at, _)| free >> (at & 63) & 1 == 0);
+            return needed.any(|(_, (t, v))| !self.quantiser.leaves(*v, *t));
+        }
+        // Of known length in the usual case: then it takes a few instructions.
+        match (target.first_chunk::<BLOCK>(), values.first_chunk::<BLOCK>()) {
+            (Some(target), Some(values)) => moved(target, values),
+            _ => moved(target, values),
+        }
     }
 
     fn steps(&self, at: usize, predicted: i32) -> i32 {
+        if self.free(at) & 1 != 0 {
+            return 0;
+        }
         let target = self.target.get(at).copied().unwrap_or_default();
         let off = i32::from(target).wrapping_sub(predicted);
-        let (far, step) = (off.wrapping_abs(), self.step);
-        if far <= i32::from(self.dead_zone) {
+        let Quantiser { step, dead_zone } = self.quantiser;
+        let (far, step) = (off.wrapping_abs(), i32::from(step.max(1)));
+        if target == 0 {
+            // What goes beyond ends there.
+            let most = far.wrapping_add(step).wrapping_sub(1);
+            return 0i32.wrapping_sub(most.checked_div(step).unwrap_or(0));
+        }
+        if far <= i32::from(dead_zone) {
             return 0;
         }
         let nearest = far.wrapping_add(step >> 1).checked_div(step).unwrap_or(0);
         // Fewer steps cost fewer bits.
         let fewer = nearest.wrapping_sub(1);
         let rest = far.wrapping_sub(fewer.wrapping_mul(step));
-        let steps = if nearest > 1 && rest <= i32::from(self.dead_zone) {
+        let steps = if nearest > 1 && rest <= i32::from(dead_zone) {
             fewer
         } else {
             nearest
@@ -706,7 +741,15 @@ mod tests {
     ) -> Vec<u8> {
         let mut out = vec![0; MAX_SLICE_BYTES];
         let state = &mut state.state();
-        let length = encode_slice(&scene.neighbours, quantiser, state, target, first, &mut out);
+        let length = encode_slice(
+            &scene.neighbours,
+            quantiser,
+            state,
+            target,
+            &[],
+            first,
+            &mut out,
+        );
         out.truncate(length.unwrap());
         out
     }
@@ -776,6 +819,63 @@ mod tests {
     }
 
     #[test]
+    fn points_that_may_say_anything_save_bytes_and_the_others_end_within_the_bound() {
+        let scene = Scene::new(SLICE_POINTS, 1);
+        let quantiser = Quantiser {
+            step: 3,
+            dead_zone: 2,
+        };
+        // Every other eight, and all of the second half.
+        let mut free = [0xff00_ff00_ff00_ff00; SLICE_POINTS / 64];
+        free[SLICE_POINTS / 128..].fill(u64::MAX);
+        let mut sides = [Owned::new(SLICE_POINTS), Owned::new(SLICE_POINTS)];
+        let start = scene.target(0, &mut Random(9));
+        both(&scene, quantiser, &mut sides, &start, true);
+        let opened = sides[0].value.clone();
+        for frame in 1..8 {
+            let target = scene.target(frame * 3, &mut Random(frame));
+            let whole = both(&scene, quantiser, &mut sides.clone(), &target, false);
+            let [server, client] = &mut sides;
+            let mut bytes = vec![0; MAX_SLICE_BYTES];
+            let state = &mut server.state();
+            let near = &scene.neighbours;
+            let length = encode_slice(near, quantiser, state, &target, &free, false, &mut bytes);
+            let bytes = &bytes[..length.unwrap()];
+            decode_slice(near, quantiser.step, &mut client.state(), false, bytes).unwrap();
+            assert!(server == client);
+            assert!(
+                bytes.len() < whole.len(),
+                "{} of {}",
+                bytes.len(),
+                whole.len()
+            );
+            for (at, (value, target)) in server.value.iter().zip(&target).enumerate() {
+                let is_free = free[at / 64] >> (at % 64) & 1 != 0;
+                assert!(
+                    is_free || value.abs_diff(*target) <= quantiser.bound(),
+                    "{at}"
+                );
+            }
+            // A block that is free as a whole stays as it is.
+            let half = SLICE_POINTS / 2;
+            assert!(server.value[half..] == opened[half..]);
+        }
+    }
+
+    #[test]
+    fn what_is_to_be_black_becomes_black_within_the_dead_zone_too() {
+        let scene = Scene::new(SLICE_POINTS, 1);
+        for (step, dead_zone) in [(3, 2), (4, 3), (6, 4), (1, 9)] {
+            let quantiser = Quantiser { step, dead_zone };
+            let mut sides = [Owned::new(SLICE_POINTS), Owned::new(SLICE_POINTS)];
+            let start: Vec<u8> = (0..SLICE_POINTS).map(|at| (at % 7) as u8).collect();
+            both(&scene, quantiser, &mut sides, &start, true);
+            both(&scene, quantiser, &mut sides, &[0; SLICE_POINTS], false);
+            assert_eq!(sides[0].value, [0; SLICE_POINTS]);
+        }
+    }
+
+    #[test]
     fn step_1_without_dead_zone_loses_nothing() {
         let scene = Scene::new(SLICE_POINTS, 1);
         let quantiser = Quantiser {
@@ -826,7 +926,15 @@ mod tests {
         for room in 0..length {
             let (mut out, mut state) = (vec![0; room], Owned::new(SLICE_POINTS));
             let state = &mut state.state();
-            let result = encode_slice(&scene.neighbours, quantiser, state, &target, true, &mut out);
+            let result = encode_slice(
+                &scene.neighbours,
+                quantiser,
+                state,
+                &target,
+                &[],
+                true,
+                &mut out,
+            );
             assert_eq!(result, Err(Full));
         }
     }

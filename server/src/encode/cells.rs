@@ -1,5 +1,6 @@
 //! Profile `cells`, the paper's (section 3.4): whole cells that differ from what the client has.
 
+use super::sight::Sight;
 use super::{Compression, FrameStats, View, compress, compressor, write_content};
 use crate::truth::Truth;
 use crate::world::World;
@@ -23,6 +24,8 @@ pub const NORMAL_THRESHOLD: f32 = 0.98;
 /// What a client of profile `cells` has.
 pub struct Cells {
     pub mirror: Mirror<Heap>,
+    /// For figures: what a client would need of what it gets.
+    pub sight: Sight,
     threshold: u8,
     compression: Compression,
     /// Cells that may differ from the mirror; and buckets that the mirror has something in.
@@ -35,15 +38,17 @@ pub struct Cells {
 
 impl Cells {
     pub fn new(
-        truth: &Truth,
+        world: &World,
         capacity: Capacity,
         threshold: u8,
         compression: Compression,
     ) -> Cells {
+        let truth = &world.truth;
         let mut due_cells = vec![0; dirty::words(truth.cells.len())];
         dirty::mark_all(&mut due_cells, truth.cells.len());
         Cells {
             mirror: Mirror::new(Heap::new(capacity)),
+            sight: Sight::new(world.slices.len()),
             threshold,
             compression,
             send_cells: vec![0; due_cells.len()],

@@ -1,13 +1,14 @@
 //! Profile `residual`: patches once, then slices' occlusion, the largest visible error first.
 
+use super::sight::Sight;
 use super::{Compression, Eye, FrameStats, View, capacity_of, compress, compressor, write_content};
-use crate::render::{Fragment, first_visible};
-use crate::world::{Slice, World};
+use crate::facing::Faces;
+use crate::world::{PointBits, SLICE_POINTS, Slice, World};
 use glam::Vec3;
 use psao::memory::{Heap, SliceHeap};
 use psao_core::bins::Bin;
 use psao_core::mirror::Capacity;
-use psao_core::residual::{MAX_SLICE_BYTES, Quantiser, SliceState, encode_slice};
+use psao_core::residual::{BLOCK, MAX_SLICE_BYTES, Quantiser, SliceState, encode_slice};
 use psao_core::slices::{self, FIRST, ITEM_HEADER_BYTES, Item, Operation};
 use psao_core::stream::{CHANGES_HEADER_BYTES, Writer, kind};
 use psao_core::topology::LEVELS;
@@ -43,18 +44,6 @@ impl Limits {
 /// Largest content of a packet of patches or slices.
 const PACKET_BYTES: usize = 1 << 18;
 
-/// Points of a slice that are looked for from the camera until one is in sight: when the slice comes
-/// into the frustum, and in every how manieth frame from then on. What is behind walls so waits,
-/// and what is about to come out is found before it shows.
-const FIRST_LOOKS: u32 = 64;
-const LOOKS: u32 = 16;
-const LOOK_EVERY: u64 = 3;
-
-/// Rays through the picture that a frame casts, across and down, as long as slices in the frustum
-/// have not been in sight: what shows between two columns is found the sooner the more of the
-/// picture it fills.
-const PICTURE_LOOKS: [u32; 2] = [32, 18];
-
 /// Slices coded side by side before the budget is looked at again.
 const BATCH: usize = 64;
 
@@ -72,15 +61,9 @@ pub struct Residual {
     limits: Limits,
     /// Patches that the client has.
     has_patch: Vec<bool>,
-    /// Slices whose occlusion, or cells, may differ from the client's.
-    due: Vec<bool>,
-    /// The frame in which each slice was last in view.
-    seen: Vec<u64>,
-    /// Slices of which something was in sight, not only in the frustum.
-    sighted: Vec<bool>,
-    /// Whether all slices in the frustum were, in the last frame.
-    all_sighted: bool,
-    frames: u64,
+    /// Of each slice, the blocks whose occlusion, or place in cells, may differ from the client's.
+    due: Vec<u64>,
+    sight: Sight,
     /// Slices on their way from one level's picture to another's.
     fades: BTreeMap<u32, Fade>,
     space: Space,
@@ -109,7 +92,11 @@ pub struct Packets {
 struct Lack {
     index: u32,
     opens: bool,
-    /// Visible error: squared, over all points, a square metre's part of the picture.
+    /// Blocks to bring up to date. The others are not in the picture, and stay as they are.
+    blocks: u64,
+    /// Points (of the world's) that are not in the picture.
+    free: PointBits,
+    /// Visible error: squared, over all other points, a square metre's part of the picture.
     weight: f32,
 }
 
@@ -117,6 +104,9 @@ struct Lack {
 struct Coded {
     index: u32,
     opens: Option<[u32; 3]>,
+    /// Blocks that were to be brought up to date, and those with points that still differ.
+    blocks: u64,
+    left: u64,
     values: Vec<u8>,
     last: Vec<i8>,
     bytes: Vec<u8>,
@@ -147,12 +137,8 @@ impl Residual {
             quantiser,
             limits,
             has_patch: vec![has_patches; capacity.patches as usize],
-            due: vec![true; world.slices.len()],
-            seen: vec![0; world.slices.len()],
-            sighted: vec![false; world.slices.len()],
-            all_sighted: false,
-            // So that no slice was seen in the frame before the first.
-            frames: 1,
+            due: vec![u64::MAX; world.slices.len()],
+            sight: Sight::new(world.slices.len()),
             fades: BTreeMap::new(),
             space: Space::new(capacity.points),
             cells: scarce.then(|| vec![0; world.slices.len()]),
@@ -175,9 +161,9 @@ impl Residual {
         [has.count(), all.len()]
     }
 
-    /// Whether the client needs a slice that its frustum holds.
-    pub fn needs(&self, slice: usize) -> bool {
-        self.sighted[slice]
+    /// Slices of which the client needs something.
+    pub fn needed(&self) -> &[u32] {
+        self.sight.needed()
     }
 
     pub fn capacity(&self) -> Capacity {
@@ -196,8 +182,8 @@ impl Residual {
     }
 
     pub fn merge(&mut self, world: &World) {
-        for (slice, due) in self.due.iter_mut().enumerate() {
-            *due |= world.has_changed(slice);
+        for (due, changed) in self.due.iter_mut().zip(world.changed()) {
+            *due |= changed;
         }
     }
 
@@ -214,7 +200,6 @@ impl Residual {
     }
 
     pub fn frame(&mut self, world: &World, view: &View<'_>, stats: &mut FrameStats) -> Packets {
-        self.frames += 1;
         let mut room = if self.limits.max_mbit > 0.0 {
             self.budget() - self.debt
         } else {
@@ -222,14 +207,8 @@ impl Residual {
         };
         let mut out = Frame::default();
         self.drop_absent(world, &mut out);
-        if let Some(eye) = &view.eye
-            && !self.all_sighted
-        {
-            self.look(world, eye);
-        }
+        self.sight.look(world, view);
         let mut lacks = self.lacks(world, view);
-        let mut in_view = self.seen.iter().zip(&self.sighted);
-        self.all_sighted = in_view.all(|(seen, sighted)| *sighted || *seen < self.frames);
         self.choose_levels(world, view, &lacks, room, &mut out);
         if !out.closes.is_empty() {
             // What changed its level is lacking as a whole now.
@@ -239,7 +218,7 @@ impl Residual {
         let (mut now, mut later): (Vec<Lack>, Vec<Lack>) = (Vec::new(), Vec::new());
         for lack in lacks {
             let fading = self.fades.get(&lack.index);
-            let whole = lack.opens && fading.is_some_and(|fade| fade.begun == self.frames);
+            let whole = lack.opens && fading.is_some_and(|fade| fade.begun == self.sight.frames());
             if whole { &mut now } else { &mut later }.push(lack);
         }
         if room.is_finite() {
@@ -272,98 +251,79 @@ impl Residual {
         packets
     }
 
-    /// Marks slices that the picture shows.
-    fn look(&mut self, world: &World, eye: &Eye) {
-        let [width, height] = PICTURE_LOOKS;
-        let frame = self.frames as u32;
-        let shown: Vec<u32> = (0..width * height)
-            .into_par_iter()
-            .flat_map_iter(|look| {
-                // Somewhere in its part of the picture, evenly over the frames.
-                let own = look.wrapping_mul(0x9e37_79b9);
-                let place = |own: u32, step: u32| {
-                    own.wrapping_add(frame.wrapping_mul(step)) as f32 * 0.5f32.powi(32)
-                };
-                let x = (look % width) as f32 + place(own, 3_242_174_889);
-                let y = (look / width) as f32 + place(own << 16, 2_447_445_414);
-                let (origin, direction) = eye.camera.ray_at(x, y, width, height);
-                let usable = direction.is_finite() && origin.is_finite();
-                let hit = usable.then(|| first_visible(world, origin, direction));
-                let slices = |hit: Fragment| world.slices_near(hit.instance, hit.position);
-                hit.flatten().map(slices).into_iter().flatten()
-            })
+    /// The slices in sight that the client does not have, or that differ where it shows.
+    fn lacks(&mut self, world: &World, view: &View<'_>) -> Vec<Lack> {
+        let this = &*self;
+        let needed = this.sight.needed().par_iter();
+        let checked: Vec<(Lack, bool)> = needed
+            .filter_map(|&index| this.check(world, view, index))
             .collect();
-        for slice in shown {
-            self.sighted[slice as usize] = true;
+        let mut lacks = Vec::new();
+        for (lack, differs) in checked {
+            if differs {
+                lacks.push(lack);
+            } else {
+                // Near enough until the world changes it again.
+                self.due[lack.index as usize] &= !lack.blocks;
+            }
         }
+        lacks
     }
 
-    /// The slices in view that the client does not have, or that differ.
-    fn lacks(&mut self, world: &World, view: &View<'_>) -> Vec<Lack> {
-        let (frames, quantiser) = (self.frames, self.quantiser);
-        let (heap, fades) = (&self.heap, &self.fades);
-        let mirror = &self.mirror;
-        let marks = self.seen.par_iter_mut().zip(&mut self.sighted);
-        let marks = marks.zip(&mut self.due);
-        let lacks = world.slices.par_iter().zip(marks).enumerate();
-        lacks
-            .filter_map(|(index, (slice, ((seen, sighted), due)))| {
-                if !(view.sees)(slice.bounds) || !world.is_present(slice.instance) {
-                    return None;
-                }
-                let since = frames - *seen;
-                *seen = frames;
-                if !*sighted {
-                    *sighted = view.eye.is_none_or(|eye| {
-                        let seed = (frames as u32).wrapping_mul(0x9e37_79b9) ^ index as u32;
-                        let samples = match since {
-                            1 if (frames + index as u64).is_multiple_of(LOOK_EVERY) => LOOKS,
-                            0 | 1 => 0,
-                            _ => FIRST_LOOKS,
-                        };
-                        world.is_seen(slice, eye.camera.position, samples, seed)
-                    });
-                    if !*sighted {
-                        return None;
-                    }
-                }
-                let open = &heap.get()[index];
-                let opens = open.point_count == 0;
-                let fading = fades.contains_key(&(index as u32));
-                if !(opens || *due || fading) {
-                    return None;
-                }
-                let want = world.occlusion(slice).iter();
-                let squares: u64 = if opens {
-                    // What is missing reads as open. At equal error, new slices first.
-                    want.map(|w| u64::from(255 - w).pow(2)).sum::<u64>() + want_a_little(slice)
-                } else {
-                    let level = mirror.instances()[slice.instance as usize].level;
-                    let have = heap.values(open).iter();
-                    let levels = world.levels(slice).iter();
-                    let want = want
-                        .zip(levels)
-                        .filter(|(_, has)| u32::from(**has) >= level);
-                    let off = want.zip(have).map(|((w, _), h)| w.abs_diff(*h));
-                    let off = off.filter(|off| *off > quantiser.dead_zone);
-                    off.map(|off| u64::from(off).pow(2)).sum()
-                };
-                let shows = !opens && to_show(world, mirror, slice, open) & !open.shown != 0;
-                if squares == 0 && !shows && !fading {
-                    // Near enough until the world changes it again.
-                    *due = false;
-                    return None;
-                }
-                let near = view.eye.map_or(1.0, |eye| {
-                    distance(eye.camera.position, slice.bounds).max(0.5)
-                });
-                Some(Lack {
-                    index: index as u32,
-                    opens,
-                    weight: (squares as f32 + f32::from(u8::from(shows))) / (near * near),
-                })
-            })
-            .collect()
+    /// What the client needs of a slice in sight, and whether it lacks that; `None` if none of it
+    /// may have changed.
+    fn check(&self, world: &World, view: &View<'_>, index: u32) -> Option<(Lack, bool)> {
+        let slice = &world.slices[index as usize];
+        let open = &self.heap.get()[index as usize];
+        let opens = open.point_count == 0;
+        let due = self.due[index as usize];
+        let fading = self.fades.contains_key(&index);
+        if !(opens || fading || due != 0) {
+            return None;
+        }
+        let mut lack = Lack {
+            index,
+            opens,
+            blocks: u64::MAX,
+            free: [0; SLICE_POINTS / 64],
+            weight: 0.0,
+        };
+        let near = || {
+            let far = |eye: Eye| distance(eye.camera.position, slice.bounds).max(0.5);
+            view.eye.map_or(1.0, far).powi(2)
+        };
+        if opens {
+            // What is missing reads as open. At equal error, new slices first.
+            let want = world.occlusion(slice).iter();
+            let dark: u64 = want.map(|w| u64::from(255 - w).pow(2)).sum();
+            lack.weight = (dark + want_a_little(slice)) as f32 / near();
+            return Some((lack, true));
+        }
+        if !fading {
+            let Faces { any, all } = view.blocks(world, slice, due);
+            if any == 0 {
+                return None;
+            }
+            lack.blocks = any;
+            lack.free = free(world, view, slice, any, all);
+        }
+        let level = self.mirror.instances()[slice.instance as usize].level;
+        let (squares, near_enough) = error(
+            world,
+            slice,
+            level,
+            self.heap.values(open),
+            &lack,
+            self.quantiser,
+        );
+        let missing = to_show(world, &self.mirror, slice, open) & !open.shown;
+        let shows = missing & lack.blocks != 0;
+        lack.weight = (squares as f32 + f32::from(u8::from(shows))) / near();
+        let differs = squares > 0 || shows || fading;
+        if !differs {
+            lack.blocks &= near_enough;
+        }
+        Some((lack, differs))
     }
 
     /// Takes instances from the client that are out of the scene.
@@ -394,14 +354,13 @@ impl Residual {
         out: &mut Frame,
     ) {
         let mut nearest: BTreeMap<u32, f32> = BTreeMap::new();
-        for (index, slice) in world.slices.iter().enumerate() {
-            if self.seen[index] == self.frames {
-                let far = view
-                    .eye
-                    .map_or(0.0, |eye| distance(eye.camera.position, slice.bounds));
-                let least = nearest.entry(slice.instance).or_insert(f32::INFINITY);
-                *least = least.min(far);
-            }
+        for &index in self.sight.needed() {
+            let slice = &world.slices[index as usize];
+            let far = view
+                .eye
+                .map_or(0.0, |eye| distance(eye.camera.position, slice.bounds));
+            let least = nearest.entry(slice.instance).or_insert(f32::INFINITY);
+            *least = least.min(far);
         }
         let mut opening: Vec<u32> = lacks
             .iter()
@@ -492,7 +451,7 @@ impl Residual {
                 });
                 let fade = Fade {
                     from: shown.collect(),
-                    begun: self.frames,
+                    begun: self.sight.frames(),
                 };
                 (index, fade)
             })
@@ -506,7 +465,7 @@ impl Residual {
 
     fn close(&mut self, index: u32, out: &mut Frame) {
         self.give_back(index);
-        self.due[index as usize] = true;
+        self.due[index as usize] = u64::MAX;
         out.closes.push(index);
     }
 
@@ -532,7 +491,7 @@ impl Residual {
         let of_level = points.filter(|(_, has)| u32::from(**has) >= level);
         let mut target: Vec<u8> = of_level.map(|(occlusion, _)| *occlusion).collect();
         if let Some(fade) = self.fades.get(&index) {
-            let done = (self.frames - fade.begun) as f32 / (FADE_S * self.rate_hz).max(1.0);
+            let done = (self.sight.frames() - fade.begun) as f32 / (FADE_S * self.rate_hz).max(1.0);
             for (to, from) in target.iter_mut().zip(&fade.from) {
                 let (from, to_f) = (f32::from(*from), f32::from(*to));
                 *to = (from + (to_f - from) * done.min(1.0)).round() as u8;
@@ -557,18 +516,29 @@ impl Residual {
             let (slice, topology) = (slice(lack), &world.topology);
             topology.neighbours(slice.patch, level(slice));
         });
-        let mut ready: Vec<(u32, Option<[u32; 3]>)> = Vec::new();
+        let mut ready: Vec<(&Lack, Option<[u32; 3]>)> = Vec::new();
         for lack in batch {
             if lack.opens {
                 let opens = self.open(world, lack.index, out);
-                ready.extend(opens.map(|opens| (lack.index, Some(opens))));
+                ready.extend(opens.map(|opens| (lack, Some(opens))));
             } else {
+<<<<<<< HEAD
                 ready.push((lack.index, None));
+=======
+                let slice = slice(lack);
+                let level = self.mirror.instances()[slice.instance as usize].level;
+                let neighbours = world.topology.neighbours(slice.patch, level, false);
+                let mut slices = self.heap.slices();
+                slices
+                    .prepare(&self.mirror, lack.index, Some(neighbours))
+                    .expect("own slices are open");
+                ready.push((lack, None));
+>>>>>>> refs/heads/send
             }
         }
         let coded: Vec<Coded> = ready
             .par_iter()
-            .map(|&(index, opens)| self.code(world, index, opens))
+            .map(|&(lack, opens)| self.code(world, lack, opens))
             .collect();
         for coded in coded {
             stats.encode_ns += coded.encode_ns;
@@ -622,13 +592,13 @@ impl Residual {
         stats.slices += 1;
         out.items
             .push((index, operation, slice.point_count, coded.bytes));
-        let fading = self
-            .fades
-            .get(&index)
-            .is_some_and(|fade| self.frames - fade.begun < (FADE_S * self.rate_hz).ceil() as u64);
+        let fading = self.fades.get(&index).is_some_and(|fade| {
+            self.sight.frames() - fade.begun < (FADE_S * self.rate_hz).ceil() as u64
+        });
         if !fading {
             self.fades.remove(&index);
-            self.due[index as usize] = false;
+            let due = &mut self.due[index as usize];
+            *due = *due & !coded.blocks | coded.left;
         }
     }
 
@@ -655,9 +625,10 @@ impl Residual {
             }
             let heap = self.heap.get();
             let idle = (0..heap.len() as u32).filter(|&other| {
-                heap[other as usize].point_count > 0 && self.seen[other as usize] < self.frames
+                heap[other as usize].point_count > 0
+                    && self.sight.last_seen(other) < self.sight.frames()
             });
-            let oldest = idle.min_by_key(|&other| self.seen[other as usize])?;
+            let oldest = idle.min_by_key(|&other| self.sight.last_seen(other))?;
             self.close(oldest, out);
         };
         if let Some(cells) = &mut self.cells {
@@ -673,12 +644,26 @@ impl Residual {
         Some(opens)
     }
 
-    fn code(&self, world: &World, index: u32, opens: Option<[u32; 3]>) -> Coded {
+    fn code(&self, world: &World, lack: &Lack, opens: Option<[u32; 3]>) -> Coded {
+        let Lack { index, blocks, .. } = *lack;
         let slice = self.heap.get()[index as usize];
         let target = self.target(world, index);
+        let of = &world.slices[index as usize];
+        let level = self.mirror.instances()[of.instance as usize].level;
+        // The numbers that the points of the level have in the world's slice.
+        let numbers = (0..).zip(world.levels(of));
+        let numbers = numbers.filter(|(_, has)| u32::from(**has) >= level);
+        let numbers = numbers.map(|(number, _): (usize, _)| number);
+        let is_free = |number: usize| lack.free[number / 64] >> (number % 64) & 1 != 0;
+        let mut free = [0; SLICE_POINTS / 64];
+        for (at, number) in numbers.clone().enumerate() {
+            free[at / 64] |= u64::from(is_free(number)) << (at % 64);
+        }
         let mut coded = Coded {
             index,
             opens,
+            blocks,
+            left: 0,
             values: self.heap.values(&slice).to_vec(),
             last: self.heap.last(&slice).to_vec(),
             bytes: vec![0; MAX_SLICE_BYTES],
@@ -699,12 +684,17 @@ impl Residual {
             quantiser,
             &mut state,
             &target,
+            &free,
             opens.is_some(),
             &mut coded.bytes,
         )
         .expect("a slice has the room asked for");
         coded.encode_ns = start.elapsed().as_nanos() as u64;
         coded.bytes.truncate(length);
+        for (number, (has, wants)) in numbers.zip(coded.values.iter().zip(&target)) {
+            let differs = is_free(number) && !quantiser.leaves(*has, *wants);
+            coded.left |= u64::from(differs) << (number / BLOCK);
+        }
         coded
     }
 
@@ -731,6 +721,63 @@ fn to_show(world: &World, mirror: &Mirror<Heap>, slice: &Slice, open: &slices::S
     } else {
         open.all_blocks()
     }
+}
+
+/// The points of some blocks of a slice that are not in the picture; `all`: the blocks that have none.
+/// All points of other blocks are not either.
+fn free(world: &World, view: &View<'_>, slice: &Slice, any: u64, all: u64) -> PointBits {
+    let mut free = [0; SLICE_POINTS / 64];
+    let Some(eye) = view.eye else { return free };
+    let facing = match any & !all {
+        0 => [u64::MAX; SLICE_POINTS / 64],
+        mixed => world.points_facing(slice, eye.camera.position, mixed),
+    };
+    for (word, (free, facing)) in free.iter_mut().zip(facing).enumerate() {
+        for part in 0..64 / BLOCK {
+            let in_picture = any >> (word * (64 / BLOCK) + part) & 1 != 0;
+            let block = ((1 << BLOCK) - 1) << (part * BLOCK);
+            *free |= block & if in_picture { !facing } else { u64::MAX };
+        }
+    }
+    free
+}
+
+/// Squared error of a slice's points in the picture that the codec would not leave as they are; and
+/// the blocks in which it would leave all, in the picture or not. `have`: what the client's points
+/// of the level say.
+fn error(
+    world: &World,
+    slice: &Slice,
+    level: u32,
+    have: &[u8],
+    lack: &Lack,
+    quantiser: Quantiser,
+) -> (u64, u64) {
+    let (mut squares, mut near_enough) = (0, u64::MAX);
+    let mut compare = |at: usize, want: u8, have: u8| {
+        if !quantiser.leaves(have, want) {
+            near_enough &= !(1 << (at / BLOCK));
+            if lack.free[at / 64] >> (at % 64) & 1 == 0 {
+                squares += u64::from(want.abs_diff(have)).pow(2);
+            }
+        }
+    };
+    let want = world.occlusion(slice);
+    if want.len() == have.len() {
+        let pairs = want.chunks(BLOCK).zip(have.chunks(BLOCK)).enumerate();
+        for (block, (want, have)) in pairs.filter(|(block, _)| lack.blocks >> block & 1 != 0) {
+            for (at, (want, have)) in (block * BLOCK..).zip(want.iter().zip(have)) {
+                compare(at, *want, *have);
+            }
+        }
+    } else {
+        let points = want.iter().zip(world.levels(slice)).enumerate();
+        let of_level = points.filter(|(_, (_, has))| u32::from(**has) >= level);
+        for ((at, (want, _)), have) in of_level.zip(have) {
+            compare(at, *want, *have);
+        }
+    }
+    (squares, near_enough)
 }
 
 /// A slice without darkness is still a little better had than not.
