@@ -287,7 +287,8 @@ fn items_whose_bytes_do_not_fit_are_refused() {
         assert_eq!(error, Some(StreamError::Length.into()), "{short} bytes");
     }
     refused(&[&good, &[0x80]], "15.2: length");
-    // The data itself ends too early, or too late. (None at all say that all points move, by nothing.)
+    // The data itself ends too early, or too late. (None at all say that all points move, by
+    // nothing.)
     for data in [vec![0], [&data[..], &[0]].concat(), vec![0xff; 9]] {
         let list = items(&[(0, Operation::Open([0, 0, 0], 3), count, data)]);
         refused(&[&list], "15.9: end of the data");

@@ -411,7 +411,8 @@ impl Side for Decode<'_> {
 }
 
 /// Steps to either side with a symbol of their own, after the one for none. Each symbol after
-/// these is for twice as many sizes as the one before, told apart by plain bits, and for both sides.
+/// these is for twice as many sizes as the one before, told apart by plain bits, and for both
+/// sides.
 const LAST_ALONE: u32 = 4;
 /// Plain bits of the last symbol, its side not counted.
 const LONGEST: u32 = SYMBOLS as u32 - 1 - 2 * LAST_ALONE;

@@ -255,8 +255,8 @@ impl Slices<'_> {
         Ok(kept)
     }
 
-    /// Opens a slice: all its points are open and in no cell. `known`: its neighbours, if the caller
-    /// has found them before.
+    /// Opens a slice: all its points are open and in no cell. `known`: its neighbours, if the
+    /// caller has found them before.
     ///
     /// # Errors
     /// There is no such slice, or it is open already; its instance has no grid; its patch has not

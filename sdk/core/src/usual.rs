@@ -623,3 +623,27 @@ pub static FIRST: [[Row; DARKS]; SPREADS] = [
          634, 960, 1567, 2712, 5442, 18221, 63805],
     ],
 ];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn no_answer_is_so_rare_that_a_slice_outgrows_its_bytes() {
+        let later = LATER.as_flattened().as_flattened();
+        for row in later.iter().chain(FIRST.as_flattened()) {
+            let ends = row.iter().map(|end| u32::from(*end)).chain([65536]);
+            let mut before = 0;
+            for end in ends {
+                assert!(end >= before + 8, "{row:?}");
+                before = end;
+            }
+        }
+        let blocks = BLOCK.as_flattened().as_flattened().iter();
+        assert!(
+            blocks
+                .chain(&FIRST_BLOCK)
+                .all(|odds| (256..=65280).contains(odds))
+        );
+    }
+}
