@@ -6,7 +6,7 @@ use crate::points::SurfacePoint;
 use crate::rays::Tracer;
 use crate::scene::{Placement, Pose, Scene};
 use crate::server::Settings;
-use crate::world::{MAX_REFRESH_STEPS, Options, Progress, World};
+use crate::world::{Options, Progress, World};
 use clap::{Args, ValueEnum};
 use glam::Vec3;
 use psao_core::Kernel;
@@ -34,10 +34,10 @@ pub struct SceneArgs {
     /// Rays a point, 1 to 4096
     #[arg(long, value_name = "N", default_value_t = 256)]
     pub rays: usize,
-    /// Steps in which each point near what moves is traced once, in turn with its neighbours: 1, 2,
-    /// 4 or 8. Without it, serve takes as many as keep its rate, and all others 1
-    #[arg(long, value_name = "N", value_parser = refresh_steps)]
-    pub refresh_steps: Option<u32>,
+    /// Rays that a frame spends on points near what moves, about; those whose lag shows most come
+    /// first. Without it, serve spends as many as keep its rate, and all others what is needed
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
+    pub refresh_rays: Option<u64>,
     /// Longest ray, metres
     #[arg(long, value_name = "METRES", default_value_t = 0.6)]
     pub ao_distance: f32,
@@ -50,13 +50,6 @@ pub struct SceneArgs {
     /// Seed of the point placement and of the boulders
     #[arg(long, value_name = "N", default_value_t = 1)]
     pub seed: u64,
-}
-
-fn refresh_steps(text: &str) -> Result<u32, String> {
-    let steps = text.parse().ok();
-    steps
-        .filter(|steps: &u32| steps.is_power_of_two() && *steps <= MAX_REFRESH_STEPS)
-        .ok_or_else(|| "must be 1, 2, 4 or 8".into())
 }
 
 /// A kernel by name.
@@ -179,7 +172,7 @@ impl SceneArgs {
         Ok(Options {
             density: self.density,
             rays: self.rays,
-            refresh_steps: self.refresh_steps.unwrap_or(1),
+            refresh_rays: self.refresh_rays.unwrap_or(u64::MAX),
             ao_distance_m: self.ao_distance,
             adaptive: self.placement == PlacementArg::Adaptive,
             seed: self.seed,

@@ -140,12 +140,13 @@ pub fn serve(args: &ServeArgs, out: &mut dyn Write, progress: Progress<'_>) -> R
     let mut frames = 0;
     while args.frames.is_none_or(|last| frames < last) {
         let began = Instant::now();
-        if args.scene.refresh_steps.is_none() {
-            server.world.options.refresh_steps = pace.refresh_steps;
+        if args.scene.refresh_rays.is_none() {
+            server.world.options.refresh_rays = pace.refresh_rays;
         }
         let time_s = (began - start).as_secs_f64();
-        server.frame(&mut transport, time_s, pace.converge_rays);
-        pace.after(began.elapsed().as_secs_f32() / period.as_secs_f32());
+        let report = server.frame(&mut transport, time_s, pace.converge_rays);
+        let busy = began.elapsed().as_secs_f32() / period.as_secs_f32();
+        pace.after(busy, &report.step);
         frames += 1;
         next = (next + period).max(Instant::now());
         std::thread::sleep(next - Instant::now().min(next));

@@ -184,6 +184,12 @@ pub struct Row {
     pub select_ms: f64,
     /// Median milliseconds of the world's step, on all threads; shared by all clients.
     pub step_ms: f64,
+    /// 99th percentile of the same.
+    pub step_p99_ms: f64,
+    /// Median milliseconds of a step and then a frame for one client.
+    pub frame_ms: f64,
+    /// 99th percentile of the same.
+    pub frame_p99_ms: f64,
     /// Rays traced a frame.
     pub rays_per_frame: f64,
     /// Points of the client's buffers that a frame changed.
@@ -349,7 +355,9 @@ impl Bench<'_> {
 
         for &rate_hz in &args.rates {
             // Back to the start, with all that will be seen as it is then.
+            world.eyes.clear();
             world.step(0.0, &seen, u64::MAX);
+            world.converge(&seen, world.options.rays, &|_, _| ());
             world.clear_changes();
             let name = format!("{rate_hz} Hz");
             let frames = |done, total| progress(&stage(&name), done, total);
@@ -383,6 +391,7 @@ impl Bench<'_> {
                 eye: Some(Eye::of(&path.at(time), args.size.1 as u32)),
             };
             let start = Instant::now();
+            world.eyes = vec![path.at(time).position];
             let step = world.step(time, &visible, u64::MAX);
             step_ms.push(ms(start));
             rays.push(step.rays as f64);
@@ -408,12 +417,18 @@ impl Bench<'_> {
         let steady = left_out(args.frames, rate_hz) as usize;
         for stream in streams {
             let cells = stream.encoder.cells(world);
+            let steps = step_ms[steady..].iter();
+            let frames = steps.zip(&stream.frames[steady..]);
+            let frames: Vec<f64> = frames.map(|(step, own)| step + own.encode_ms).collect();
             found.kbits.push(stream.kbits());
             found.rows.push(Row {
                 scene: world.scene.name.clone(),
                 density: world.options.density,
                 rate_hz,
                 step_ms: percentile(&step_ms[steady..], 0.5),
+                step_p99_ms: percentile(&step_ms[steady..], 0.99),
+                frame_ms: percentile(&frames, 0.5),
+                frame_p99_ms: percentile(&frames, 0.99),
                 rays_per_frame: mean(&rays[steady..]),
                 cells_skipped_share: cells
                     .map_or(0.0, |[has, all]| 1.0 - has as f64 / all.max(1) as f64),
@@ -765,6 +780,9 @@ impl Evaluation {
             "encode ms",
             "select ms",
             "step ms",
+            "p99",
+            "step + encode",
+            "p99",
             "krays",
             "points",
             "skipped",
@@ -792,6 +810,9 @@ impl Evaluation {
                 format!("{:.3}", row.encode_ms),
                 format!("{:.3}", row.select_ms),
                 format!("{:.1}", row.step_ms),
+                format!("{:.1}", row.step_p99_ms),
+                format!("{:.1}", row.frame_ms),
+                format!("{:.1}", row.frame_p99_ms),
                 format!("{:.1}", row.rays_per_frame / 1e3),
                 format!("{:.0}", row.points_changed_per_frame),
                 format!("{:.0} %", row.cells_skipped_share * 100.0),

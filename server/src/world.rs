@@ -41,11 +41,10 @@ pub struct Options {
     pub ao_distance_m: f32,
     /// Rays a point, 1 to 4096.
     pub rays: usize,
-    /// Steps in which each point near what moves is traced once, in turn with its neighbours: 1
-    /// for all of them at every step, 2, 4, or [`MAX_REFRESH_STEPS`] (what is between counts as the
-    /// next higher). What a point says lags by up to one step less; all is up to date as many
-    /// steps after the last move. May be changed between steps.
-    pub refresh_steps: u32,
+    /// Rays that a step spends on points near what moves, about; `u64::MAX` for all that they
+    /// need. Where that is less, those have their turn first whose lag is likely to show most, and
+    /// all are up to date some steps after the last move. May be changed between steps.
+    pub refresh_rays: u64,
     /// Kernel that the grid is laid out for.
     pub kernel: Kernel,
     /// Interpolation radius r over the largest Poisson radius rm.
@@ -75,7 +74,7 @@ impl Options {
             density: 512.0,
             ao_distance_m: 0.6,
             rays: 256,
-            refresh_steps: 1,
+            refresh_rays: u64::MAX,
             kernel,
             radius_over_rm,
             cell_over_radius,
@@ -138,9 +137,6 @@ const AWAY_M: f32 = 1e7;
 /// Most points of a scene: about 90 bytes each.
 pub const MAX_POINTS: u64 = 1 << 26;
 
-/// Most steps in which points may take turns ([`Options::refresh_steps`]).
-pub const MAX_REFRESH_STEPS: u32 = 8;
-
 /// A set of a slice's points, the first in the lowest bit of the first word.
 pub type PointBits = [u64; SLICE_POINTS / 64];
 
@@ -188,6 +184,8 @@ pub struct StepStats {
     pub points: u64,
     /// Visible slices that have not reached all their rays.
     pub converging: u64,
+    /// Points near what moves, in blocks of [`BLOCK`], that wait for their turn.
+    pub waiting: u64,
 }
 
 /// A progress report: stage, done, total.
@@ -201,6 +199,9 @@ pub struct World {
     pub options: Options,
     /// Where everything is.
     pub pose: Pose,
+    /// Where clients look from, metres from the scene's origin: points near what moves are only
+    /// brought up to date when they may face one ([`World::facing`]). None: all are.
+    pub eyes: Vec<Vec3>,
     /// Instances' grids; and, unless [`Options::rest_space`], buckets and cells.
     pub truth: Truth,
     /// With [`Options::rest_space`], points a mesh.
@@ -235,8 +236,10 @@ pub struct World {
     moves: Vec<bool>,
     /// Where each instance that moves is, now and at the step before.
     swept: Vec<[Hull; 2]>,
-    /// Of each slice, which of its points are due.
+    /// Of each slice, which of its blocks are due.
     turns: Vec<Turn>,
+    /// The blocks of all slices, [`SLICE_BLOCKS`] each.
+    blocks: Vec<Block>,
     /// Calls of [`World::step`].
     steps: u64,
     /// Space for what the traced points say, kept from step to step.
@@ -303,6 +306,8 @@ impl World {
             fixed: Vec::new(),
             swept: vec![[Hull::default(); 2]; scene.instances.len()],
             turns: Vec::new(),
+            blocks: Vec::new(),
+            eyes: Vec::new(),
             steps: 0,
             traced: Vec::new(),
             driven: BTreeMap::new(),
@@ -322,6 +327,8 @@ impl World {
         }
         world.occlusion = vec![255; world.points.len()];
         world.fixed = vec![0; world.points.len() * world.words()];
+        world.turns = vec![Turn::default(); world.slices.len()];
+        world.blocks = vec![Block::default(); world.slices.len() * SLICE_BLOCKS];
         for slice in 0..world.slices.len() {
             world.slices[slice].bounds = world.slice_bounds(slice);
         }
@@ -608,12 +615,11 @@ impl World {
         self.pose_at(time_s);
         self.mark_stale();
         self.place_deforming(visible);
-        let steps = self.options.refresh_steps.clamp(1, MAX_REFRESH_STEPS);
         self.trace(
             visible,
             converge_rays,
             self.options.rays,
-            MAX_REFRESH_STEPS / steps.next_power_of_two(),
+            self.options.refresh_rays,
             &|_, _| (),
         )
     }
@@ -628,7 +634,7 @@ impl World {
     ) -> StepStats {
         let mut total = StepStats::default();
         loop {
-            let stats = self.trace(visible, u64::MAX, rays, MAX_REFRESH_STEPS, report);
+            let stats = self.trace(visible, u64::MAX, rays, u64::MAX, report);
             total.rays += stats.rays;
             total.points += stats.points;
             if stats.converging == 0 {
@@ -791,26 +797,25 @@ impl World {
     }
 
     /// Traces what is visible and due. Slices with less than `goal` of their rays gain some, as far
-    /// as `converge_rays` goes. Of the points of the others, as many eighths as `shares` says.
+    /// as `converge_rays` goes; the others' blocks have their turn, as far as `refresh_rays` goes.
     fn trace(
         &mut self,
         visible: &(dyn Fn([Vec3; 2]) -> bool + Sync),
         converge_rays: u64,
         goal: usize,
-        shares: u32,
+        refresh_rays: u64,
         report: &(dyn Fn(u64, u64) + Sync),
     ) -> StepStats {
         let all = self.options.rays;
         let mut stats = StepStats::default();
-        // Slices, the rays that their points are to have had, and which points.
-        let mut due: Vec<(usize, usize, Share)> = Vec::new();
+        // Slices with something to do, and the rays that their points are to have had.
+        let mut asked: Vec<(usize, usize)> = Vec::new();
         let mut budget = converge_rays;
-        self.turns.resize(self.slices.len(), Turn::default());
         for (index, (slice, turn)) in self.slices.iter().zip(&mut self.turns).enumerate() {
             if !visible(slice.bounds) || self.absent.contains(&slice.instance) {
                 continue;
             }
-            let followed = turn.seen_at + 1 == self.steps;
+            turn.is_new = turn.seen_at + 1 < self.steps;
             turn.seen_at = self.steps;
             let points = slice.points.len() as u64;
             stats.rays_if_all += points * all as u64;
@@ -831,89 +836,254 @@ impl World {
                 }
                 stats.converging += u64::from(rays < goal.min(all));
             }
-            if slice.stale {
-                turn.owed = u8::MAX;
-            }
-            if rays > slice.rays_done || turn.owed > 0 && rays > 0 {
-                // What comes into view is all due at once, and so are new rays.
-                let share = if rays > slice.rays_done || !followed {
-                    turn.all()
-                } else {
-                    turn.next(shares)
-                };
-                due.push((index, rays, share));
+            if rays > slice.rays_done || slice.stale || turn.owed > 0 {
+                asked.push((index, rays));
             }
         }
-        let total: u64 = due
-            .iter()
-            .map(|&(slice, ..)| self.slices[slice].points.len() as u64)
-            .sum();
+        let (due, waiting) = self.take_turns(&asked, refresh_rays);
+        stats.waiting = waiting;
+        (stats.rays, stats.points) = self.trace_due(&due, report);
+        stats
+    }
+
+    /// Which blocks of the slices `asked` are traced now: all where rays are gained, and within a
+    /// budget of rays those of the others that something moved near. And how many of these wait.
+    fn take_turns(&mut self, asked: &[(usize, usize)], refresh_rays: u64) -> (Vec<Due>, u64) {
+        let looked: Vec<Owing> = asked
+            .par_iter()
+            .map(|&(slice, _)| self.owing(slice))
+            .collect();
+        let mut due = Vec::new();
+        let mut candidates = Vec::new();
+        for (owing, &(index, rays)) in looked.iter().zip(asked) {
+            let slice = &mut self.slices[index];
+            slice.stale = false;
+            let turn = &mut self.turns[index];
+            let all = if turn.is_new { u64::MAX } else { 0 };
+            let unknown = all | owing.near & !turn.near;
+            (turn.near, turn.owed) = (owing.near, owing.owed);
+            if rays > slice.rays_done {
+                due.push(Due {
+                    slice: index,
+                    rays,
+                    blocks: Faces::all_of(slice).any,
+                });
+            } else if rays > 0 && refresh_rays == u64::MAX {
+                due.push(Due {
+                    slice: index,
+                    rays,
+                    blocks: owing.wanted,
+                });
+            } else if rays > 0 {
+                let blocks = (0..SLICE_BLOCKS).filter(|block| owing.wanted >> block & 1 == 1);
+                for number in blocks {
+                    let at = index * SLICE_BLOCKS + number;
+                    let block = &mut self.blocks[at];
+                    if unknown >> number & 1 == 1 {
+                        block.rate = block.rate.max(NEW_RATE);
+                    }
+                    let (age, rays) = (block.age(self.steps), block.rays + BLOCK_RAYS);
+                    // The mean squared error is least, for so many rays, where each block is
+                    // traced when rate² · age³ / rays has grown to the same value.
+                    let lag = ((block.rate + LEAST_RATE) * age).min(MOST_LAG);
+                    candidates.push(Candidate {
+                        gain: lag * lag * age * owing.weight / rays as f32,
+                        rays: u64::from(rays),
+                        block: at,
+                    });
+                }
+            }
+        }
+        candidates.sort_unstable_by(|a, b| {
+            let order = b.gain.total_cmp(&a.gain);
+            order.then(a.block.cmp(&b.block))
+        });
+        let mut left = refresh_rays;
+        let fits = |candidate: &&Candidate| {
+            let fits = left > 0;
+            left = left.saturating_sub(candidate.rays);
+            fits
+        };
+        let taken = candidates.iter().take_while(fits).count();
+        let waiting = (candidates.len() - taken) as u64;
+        candidates.truncate(taken);
+        candidates.sort_unstable_by_key(|candidate| candidate.block);
+        for turn in candidates.chunk_by(|a, b| a.block / SLICE_BLOCKS == b.block / SLICE_BLOCKS) {
+            let index = turn[0].block / SLICE_BLOCKS;
+            let bits = turn.iter().map(|own| 1u64 << (own.block % SLICE_BLOCKS));
+            due.push(Due {
+                slice: index,
+                rays: self.slices[index].rays_done,
+                blocks: bits.fold(0, |blocks, bit| blocks | bit),
+            });
+        }
+        due.retain(|due| due.blocks > 0);
+        due.sort_unstable_by_key(|due| due.slice);
+        (due, waiting)
+    }
+
+    /// What a visible slice owes in the present pose.
+    fn owing(&self, index: usize) -> Owing {
+        let (slice, turn) = (&self.slices[index], &self.turns[index]);
+        let (near, owed) = if slice.stale {
+            (self.near_movers(slice), u64::MAX)
+        } else {
+            (turn.near, turn.owed)
+        };
+        // What no mover reaches, and none did, says what it said.
+        let owed = owed & (near | turn.had) & Faces::all_of(slice).any;
+        let mut owing = Owing {
+            near,
+            owed,
+            wanted: owed,
+            weight: 1.0,
+        };
+        if !self.eyes.is_empty() && owed > 0 {
+            let [min, max] = slice.bounds;
+            let eyes = self.eyes.iter();
+            let far = eyes.map(|eye| eye.distance(eye.clamp(min, max)));
+            let nearest = far.fold(f32::INFINITY, f32::min).max(NEAREST_M);
+            // Its part of the picture.
+            owing.weight = 1.0 / (nearest * nearest);
+            let eyes = self.eyes.iter();
+            owing.wanted &= eyes.fold(0, |faces, eye| faces | self.facing(slice, *eye).any);
+        }
+        owing
+    }
+
+    /// The blocks of a slice from which a ray may meet what moves.
+    fn near_movers(&self, slice: &Slice) -> u64 {
+        let instance = slice.instance as usize;
+        let Some(cones) = self.cones_at(slice).filter(|_| !self.moves[instance]) else {
+            return u64::MAX;
+        };
+        let reach = self.options.ao_distance_m;
+        let movers = (0..self.moves.len()).filter(|&mover| self.moves[mover]);
+        let movers = movers.map(|mover| &self.swept[mover][0]);
+        let movers: Vec<&Hull> = movers
+            .filter(|mover| mover.is_near(slice.bounds, reach))
+            .collect();
+        let world = &self.pose.instances[instance].world_from_local;
+        let stretch = stretch(world);
+        let is_near = |cone: &Cone| {
+            let (center, radius) = cone.ball();
+            let center = world.transform_point3(center);
+            // A little more, for rounding.
+            let around = radius * stretch * 1.001 + center.abs().max_element() * 1e-5;
+            let bounds = [center - around, center + around];
+            movers.iter().any(|mover| mover.is_near(bounds, reach))
+        };
+        let near = cones.iter().rev().map(is_near);
+        near.fold(0, |blocks, near| blocks << 1 | u64::from(near))
+    }
+
+    /// Traces blocks, slice by slice in order. How many rays and points.
+    fn trace_due(&mut self, due: &[Due], report: &(dyn Fn(u64, u64) + Sync)) -> (u64, u64) {
         let words = self.words();
         // Out of the world, so that threads can fill their parts of them.
         let (mut fixed, mut traced) = (
             std::mem::take(&mut self.fixed),
             std::mem::take(&mut self.traced),
         );
-        traced.resize(total as usize, 0);
-        let mut batches = Vec::new();
+        let parts = |due: &Due| -> Vec<(Range<u32>, u8)> {
+            let points = &self.slices[due.slice].points;
+            let firsts = points.clone().step_by(BATCH_POINTS).enumerate();
+            let parts = firsts.map(|(part, first)| {
+                let last = points.end.min(first + BATCH_POINTS as u32);
+                let blocks = due.blocks >> (part * BATCH_POINTS / BLOCK);
+                (first..last, blocks as u8)
+            });
+            parts.filter(|(_, blocks)| *blocks > 0).collect()
+        };
+        let parts: Vec<(&Due, Range<u32>, u8)> = due
+            .iter()
+            .flat_map(|due| parts(due).into_iter().map(move |(p, b)| (due, p, b)))
+            .collect();
+        let total: usize = parts.iter().map(|(_, points, _)| points.len()).sum();
+        traced.resize(total, 0);
+        let mut batches = Vec::with_capacity(parts.len());
         let (mut bits, mut bits_from, mut occlusion) = (&mut fixed[..], 0, &mut traced[..]);
-        for &(slice, rays, share) in &due {
-            for first in self.slices[slice].points.clone().step_by(BATCH_POINTS) {
-                let last = self.slices[slice]
-                    .points
-                    .end
-                    .min(first + BATCH_POINTS as u32);
-                let from = first as usize * words;
-                let skipped = bits.split_at_mut(from - bits_from).1;
-                let (own, rest) = skipped.split_at_mut((last - first) as usize * words);
-                (bits, bits_from) = (rest, last as usize * words);
-                let (own_occlusion, rest) = occlusion.split_at_mut((last - first) as usize);
-                occlusion = rest;
-                batches.push(Batch {
-                    slice,
-                    points: first..last,
-                    rays,
-                    share,
-                    fixed: own,
-                    occlusion: own_occlusion,
-                });
-            }
+        for (due, points, blocks) in parts {
+            let from = points.start as usize * words;
+            let skipped = bits.split_at_mut(from - bits_from).1;
+            let (own, rest) = skipped.split_at_mut(points.len() * words);
+            (bits, bits_from) = (rest, points.end as usize * words);
+            let (own_occlusion, rest) = occlusion.split_at_mut(points.len());
+            occlusion = rest;
+            batches.push(Batch {
+                slice: due.slice,
+                points,
+                rays: due.rays,
+                blocks,
+                block_rays: [0; BATCH_POINTS / BLOCK],
+                fixed: own,
+                occlusion: own_occlusion,
+            });
         }
         let done = std::sync::atomic::AtomicU64::new(0);
-        let (rays, points) = batches
+        let counts = batches
             .par_iter_mut()
             .with_max_len(2)
             .map(|batch| {
                 let counts = self.trace_batch(batch);
                 let points = batch.points.len() as u64;
                 let so_far = done.fetch_add(points, std::sync::atomic::Ordering::Relaxed);
-                report(so_far + points, total);
+                report(so_far + points, total as u64);
                 counts
             })
             .reduce(|| (0, 0), |a, b| (a.0 + b.0, a.1 + b.1));
-        (stats.rays, stats.points) = (rays, points);
-        let mut occlusion = traced.iter();
-        for &(index, rays, _) in &due {
-            let slice = &mut self.slices[index];
-            slice.rays_done = rays;
-            slice.stale = false;
-            let (mut changed, first) = (0u64, slice.points.start as usize);
-            for (point, &occlusion) in slice.points.clone().zip(&mut occlusion) {
-                let point = point as usize;
-                if self.occlusion[point] != occlusion {
+        let mut batches = batches.iter().peekable();
+        for due in due {
+            let turn = &mut self.turns[due.slice];
+            turn.owed &= !due.blocks;
+            turn.had = turn.had & !due.blocks | turn.near & due.blocks;
+            let mut changed = 0;
+            while let Some(batch) = batches.next_if(|batch| batch.slice == due.slice) {
+                changed |= self.take_in(batch);
+            }
+            self.slices[due.slice].rays_done = due.rays;
+            if changed != 0 && self.options.rest_space {
+                self.note_change(due.slice, changed);
+            }
+        }
+        (self.fixed, self.traced) = (fixed, traced);
+        counts
+    }
+
+    /// Keeps what a batch's points say; the blocks of the slice that changed.
+    fn take_in(&mut self, batch: &Batch<'_>) -> u64 {
+        let slice = &self.slices[batch.slice];
+        let first = (batch.points.start - slice.points.start) as usize / BLOCK;
+        let gained = batch.rays > slice.rays_done;
+        let mut changed = 0;
+        for (number, occlusion) in batch.occlusion.chunks(BLOCK).enumerate() {
+            if batch.blocks >> number & 1 == 0 {
+                continue;
+            }
+            let start = batch.points.start as usize + number * BLOCK;
+            let mut squares = 0;
+            for (point, &occlusion) in (start..).zip(occlusion) {
+                let off = u32::from(self.occlusion[point].abs_diff(occlusion));
+                squares += off * off;
+                if off > 0 {
                     self.occlusion[point] = occlusion;
                     if let Some(place) = self.places.get(point) {
                         self.truth.set_occlusion(*place, occlusion);
                     }
-                    changed |= 1 << ((point - first) / BLOCK);
                 }
             }
-            if changed != 0 && self.options.rest_space {
-                self.note_change(index, changed);
+            changed |= u64::from(squares > 0) << (first + number);
+            let block = &mut self.blocks[batch.slice * SLICE_BLOCKS + first + number];
+            if !gained {
+                let change = (squares as f32 / occlusion.len() as f32).sqrt();
+                let rate = change / block.age(self.steps).max(1.0);
+                // One step without a change says little of the next.
+                block.rate = rate.max(block.rate * 0.5);
+                block.rays = batch.block_rays[number];
             }
+            block.traced_at = self.steps;
         }
-        (self.fixed, self.traced) = (fixed, traced);
-        stats
+        changed
     }
 
     /// Traces some points of a slice; rays and points that were traced.
@@ -949,8 +1119,8 @@ impl World {
             .chunks_exact_mut(words)
             .zip(&mut *batch.occlusion);
         for (number, (fixed, occlusion)) in batch.points.clone().zip(parts) {
-            if !batch.share.has(number) {
-                *occlusion = self.occlusion[number as usize];
+            let block = (number - batch.points.start) as usize / BLOCK;
+            if batch.blocks >> block & 1 == 0 {
                 continue;
             }
             let point = &self.points[number as usize];
@@ -975,6 +1145,7 @@ impl World {
             let tangent = pose.world_from_local.transform_vector3(tangent);
             let fan = self.samples.fan(number, origin, normal, tangent);
             points_traced += 1;
+            let before = rays_traced;
             hit.fill(0);
             if let Some(attached) = attached {
                 if converging {
@@ -1000,6 +1171,7 @@ impl World {
                 self.tracer
                     .occluded_fan(others, &fan, t_max, &todo, &mut hit);
             }
+            batch.block_rays[block] += (rays_traced - before) as u32;
             *occlusion = openness(&hit, rays);
         }
         (rays_traced, points_traced)
@@ -1442,43 +1614,86 @@ impl std::error::Error for NoInstance {}
 /// Points of a slice that are traced together: few, so that all threads end together.
 const BATCH_POINTS: usize = 128;
 
-/// A set of eighths of a slice's points: those whose numbers end in three bits that are in it.
-#[derive(Clone, Copy, Debug)]
-struct Share(u8);
+/// An eye within this of a slice sees no more of it, metres.
+const NEAREST_M: f32 = 0.5;
 
-impl Share {
-    fn has(self, number: u32) -> bool {
-        self.0 >> (number % MAX_REFRESH_STEPS) & 1 != 0
-    }
-}
+/// What choosing and culling the points of a block costs, in rays.
+const BLOCK_RAYS: u32 = 128;
 
-/// Which eighths of a slice's points are due, and where to go on.
+/// How fast what points say is taken to change, in 1/255 a step: at the least, as what moves may
+/// come nearer; and as long as nobody has looked, or what moves has only now come within reach.
+const LEAST_RATE: f32 = 0.5;
+const NEW_RATE: f32 = 4.0;
+
+/// More than this says no more about what is urgent, 1/255.
+const MOST_LAG: f32 = 64.0;
+
+/// Which blocks of a slice are due; the first in the lowest bit.
 #[derive(Clone, Copy, Debug, Default)]
 struct Turn {
-    owed: u8,
-    next: u32,
-    /// The step at which it was visible last.
+    /// Blocks that may say what was true before something moved.
+    owed: u64,
+    /// Those that movers reach, and those that they reached when they were traced last.
+    near: u64,
+    had: u64,
+    /// The step at which the slice was visible last; it was not at the one before.
     seen_at: u64,
+    is_new: bool,
 }
 
-impl Turn {
-    fn all(&mut self) -> Share {
-        self.owed = 0;
-        Share(u8::MAX)
-    }
+/// How urgent some points of a slice are.
+#[derive(Clone, Copy, Debug)]
+struct Block {
+    /// The step at which they were traced last.
+    traced_at: u64,
+    /// How fast what they say changed before that, 1/255 a step, root mean square.
+    rate: f32,
+    /// The rays that it took.
+    rays: u32,
+}
 
-    /// The next `shares` of what is due.
-    fn next(&mut self, shares: u32) -> Share {
-        let mut share = 0u8;
-        for _ in 0..MAX_REFRESH_STEPS {
-            if share.count_ones() < shares {
-                share |= self.owed & 1 << self.next;
-                self.next = (self.next + 1) % MAX_REFRESH_STEPS;
-            }
+impl Default for Block {
+    /// Nothing is known.
+    fn default() -> Block {
+        Block {
+            traced_at: 0,
+            rate: NEW_RATE,
+            rays: 64 * BLOCK as u32,
         }
-        self.owed &= !share;
-        Share(share)
     }
+}
+
+impl Block {
+    fn age(&self, steps: u64) -> f32 {
+        (steps - self.traced_at) as f32
+    }
+}
+
+/// What a visible slice owes: see [`Turn`].
+struct Owing {
+    near: u64,
+    owed: u64,
+    /// Blocks owed that may show.
+    wanted: u64,
+    /// What an error shows, relative to others'.
+    weight: f32,
+}
+
+/// A block that may have its turn.
+struct Candidate {
+    /// What it is worth, for each ray.
+    gain: f32,
+    rays: u64,
+    /// Into [`World::blocks`].
+    block: usize,
+}
+
+/// Blocks of a slice that are to be traced.
+struct Due {
+    slice: usize,
+    /// As many of the rays are to be known.
+    rays: usize,
+    blocks: u64,
 }
 
 /// Some points of a slice, to be traced.
@@ -1487,8 +1702,10 @@ struct Batch<'a> {
     points: Range<u32>,
     /// As many of the rays are to be known.
     rays: usize,
-    /// Which of the points.
-    share: Share,
+    /// Which of its blocks.
+    blocks: u8,
+    /// Rays that each took.
+    block_rays: [u32; BATCH_POINTS / BLOCK],
     /// Their part of [`World::fixed`].
     fixed: &'a mut [u64],
     /// What they say.
@@ -1530,15 +1747,9 @@ impl Hull {
     fn new(local: LocalHull, world_from_local: &Affine3A) -> Hull {
         let [min, max] = placed_bounds(world_from_local, local.bounds);
         let center = (min + max) * 0.5;
-        // Gershgorin's bound of the largest stretch; exact without shear.
-        let m = world_from_local.matrix3;
-        let squared = m.transpose() * m;
-        let row = |row: Vec3A| row.abs().element_sum();
-        let stretch = row(squared.x_axis)
-            .max(row(squared.y_axis))
-            .max(row(squared.z_axis));
         // A little more, for rounding.
-        let radius = local.radius * stretch.sqrt() * 1.0001 + center.abs().max_element() * 1e-6;
+        let radius =
+            local.radius * stretch(world_from_local) * 1.0001 + center.abs().max_element() * 1e-6;
         Hull {
             bounds: [min.max(center - radius), max.min(center + radius)],
             center,
@@ -1628,6 +1839,15 @@ fn placed_bounds(world_from_local: &Affine3A, [min, max]: [Vec3; 2]) -> [Vec3; 2
     let (half, m) = (Vec3A::from((max - min) * 0.5), world_from_local.matrix3);
     let half = m.x_axis.abs() * half.x + m.y_axis.abs() * half.y + m.z_axis.abs() * half.z;
     [center - Vec3::from(half), center + Vec3::from(half)]
+}
+
+/// Gershgorin's bound of the largest stretch; exact without shear.
+fn stretch(world_from_local: &Affine3A) -> f32 {
+    let m = world_from_local.matrix3;
+    let squared = m.transpose() * m;
+    let row = |row: Vec3A| row.abs().element_sum();
+    let columns = row(squared.x_axis).max(row(squared.y_axis));
+    columns.max(row(squared.z_axis)).sqrt()
 }
 
 /// Two boxes are nearer than `reach`.

@@ -4,13 +4,13 @@
 mod small_scene;
 
 use glam::{DAffine3, DVec3, Vec3};
-use psao_core::residual::Quantiser;
+use psao_core::residual::{BLOCK, Quantiser};
 use psao_core::{Bucket, Cell, Kernel};
 use psao_server::encode::{Compression, Encoder, Limits, Scheme, View};
 use psao_server::points::PointError;
 use psao_server::scene::Scene;
 use psao_server::world::{Options, World, WorldError};
-use small_scene::{MOVER, POST, SHEET, STILL, small_scene, still_scene};
+use small_scene::{FLOOR, MOVER, POST, SHEET, STILL, small_scene, still_scene};
 use std::collections::BTreeMap;
 
 fn cells(threshold: u8) -> Scheme {
@@ -290,36 +290,123 @@ fn what_is_not_traced_again_could_not_have_changed() {
 }
 
 #[test]
-fn points_that_take_turns_are_all_up_to_date_after_as_many_steps() {
-    let in_turns = Options {
-        refresh_steps: 4,
-        ..options(256.0, 64)
+fn points_that_take_turns_are_all_up_to_date_some_steps_after_the_last_move() {
+    for scheme in [cells(0), residual()] {
+        let options = laid_out(options(256.0, 64), scheme);
+        let mut at_once = world(small_scene(), options.clone());
+        let mut in_turns = world(small_scene(), options);
+        for world in [&mut at_once, &mut in_turns] {
+            converge(world);
+        }
+        in_turns.options.refresh_rays = 10_000;
+        let (left, mut lagged, mut rays) = (|[_, max]: [Vec3; 2]| max.x < 50.0, false, [0, 0]);
+        for step in 1..=12 {
+            let time = f64::from(step) * 0.05;
+            // For a while, some are not seen; they miss no turn.
+            let some = |bounds: [Vec3; 2]| !(4..=6).contains(&step) || left(bounds);
+            let (all, part) = (
+                at_once.step(time, &some, u64::MAX),
+                in_turns.step(time, &some, 0),
+            );
+            rays = [rays[0] + all.rays, rays[1] + part.rays];
+            assert_eq!(all.waiting, 0);
+            lagged |= part.waiting > 0 && !says_the_same(&at_once, &in_turns);
+        }
+        assert!(lagged && rays[1] * 2 < rays[0], "{rays:?}: none waited");
+        let mut steps = 0;
+        while in_turns.step(0.6, &all, 0).waiting > 0 {
+            steps += 1;
+            assert!(steps < 100, "some never have their turn");
+            // The server may change its mind on the way.
+            in_turns.options.refresh_rays += 1000;
+        }
+        at_once.step(0.6, &all, 0);
+        assert!(steps > 0 && says_the_same(&at_once, &in_turns));
+        assert_eq!(in_turns.step(0.6, &all, 0).rays, 0);
+    }
+}
+
+/// To the bit.
+fn says_the_same(a: &World, b: &World) -> bool {
+    let mut slices = a.slices.iter().zip(&b.slices);
+    slices.all(|(of_a, of_b)| a.occlusion(of_a) == b.occlusion(of_b))
+}
+
+#[test]
+fn a_step_with_few_rays_spends_them_where_most_has_changed() {
+    let options = laid_out(options(256.0, 64), residual());
+    let mut worlds = [64, u64::MAX, u64::MAX].map(|_| world(small_scene(), options.clone()));
+    let off = |a: &World, b: &World| -> f64 {
+        let points = |world: &World| -> Vec<u8> {
+            let said = |slice| world.occlusion(slice).to_vec();
+            world.slices.iter().flat_map(said).collect()
+        };
+        let pairs = points(a).into_iter().zip(points(b));
+        pairs.map(|(a, b)| f64::from(a.abs_diff(b)).powi(2)).sum()
     };
-    let mut at_once = world(small_scene(), options(256.0, 64));
-    let mut in_turns = world(small_scene(), in_turns);
-    let mut rays = [0, 0];
-    for world in [&mut at_once, &mut in_turns] {
+    worlds.iter_mut().for_each(converge);
+    let [in_turns, at_once, left] = &mut worlds;
+    let (mut lag, mut stale, mut rays) = (0.0, 0.0, [0, 0]);
+    for step in 1..=20 {
+        let time = f64::from(step) * 0.05;
+        rays[1] += at_once.step(time, &all, 0).rays;
+        in_turns.options.refresh_rays = rays[1] / step as u64 / 4;
+        rays[0] += in_turns.step(time, &all, 0).rays;
+        // All of it, in every fourth step: as many rays.
+        if step % 4 == 0 {
+            left.step(time, &all, 0);
+        }
+        lag += off(in_turns, at_once);
+        stale += off(left, at_once);
+    }
+    assert!(rays[0] * 3 < rays[1], "{rays:?}");
+    assert!(lag < stale, "{lag} against {stale}");
+}
+
+#[test]
+fn points_that_face_no_eye_wait_until_they_face_one() {
+    let options = laid_out(options(1024.0, 64), residual());
+    let mut whole = world(small_scene(), options.clone());
+    let mut seen = world(small_scene(), options);
+    for world in [&mut whole, &mut seen] {
         converge(world);
     }
-    let (left, mut lagged) = (|[_, max]: [Vec3; 2]| max.x < 50.0, false);
-    for step in 1..=12 {
-        let time = f64::from(step) * 0.05;
-        // For a while, some are not seen; they miss no turn.
-        let some = |bounds: [Vec3; 2]| !(4..=6).contains(&step) || left(bounds);
-        for (world, rays) in [&mut at_once, &mut in_turns].into_iter().zip(&mut rays) {
-            *rays += world.step(time, &some, u64::MAX).rays;
+    let above = (DVec3::new(50.2, 3.0, 0.1) - seen.scene.origin).as_vec3();
+    let mut rays = [0, 0];
+    for step in 1..=10 {
+        seen.eyes = vec![above];
+        for (world, rays) in [&mut whole, &mut seen].into_iter().zip(&mut rays) {
+            *rays += world.step(f64::from(step) * 0.05, &all, 0).rays;
         }
-        lagged |= at_once.truth.cells != in_turns.truth.cells;
+        for (slice, other) in seen.slices.iter().zip(&whole.slices) {
+            let faces = seen.facing(slice, above);
+            let blocks = seen.occlusion(slice).chunks(BLOCK);
+            for (block, pair) in blocks.zip(whole.occlusion(other).chunks(BLOCK)).enumerate() {
+                assert!(faces >> block & 1 == 0 || pair.0 == pair.1, "{block}");
+            }
+        }
     }
-    assert!(lagged && rays[1] * 2 < rays[0], "{rays:?}: none waited");
-    // The server may change its mind on the way.
-    for steps in [4, 2] {
-        in_turns.options.refresh_steps = steps;
-        assert!(in_turns.step(0.6, &all, u64::MAX).rays > 0);
+    assert!(rays[1] * 10 < rays[0] * 9, "{rays:?}");
+    assert!(!says_the_same(&whole, &seen));
+    seen.eyes.clear();
+    seen.step(0.5, &all, 0);
+    assert!(says_the_same(&whole, &seen));
+}
+
+#[test]
+fn in_rest_space_blocks_that_no_mover_reaches_are_left_alone_and_say_the_truth() {
+    let options = laid_out(options(256.0, 64), residual());
+    let mut stepped = world(small_scene(), options.clone());
+    converge(&mut stepped);
+    for time in [0.03, 0.1, 0.2, 0.9, 1.0, 1.1] {
+        stepped.step(time, &all, 0);
     }
-    at_once.step(0.6, &all, u64::MAX);
-    assert_same(&in_turns, &at_once);
-    assert_eq!(in_turns.step(0.6, &all, u64::MAX).rays, 0);
+    let fresh = fresh(&small_scene(), &options, 1.1);
+    for (slice, other) in stepped.slices.iter().zip(&fresh.slices) {
+        if [FLOOR, STILL].contains(&slice.instance) {
+            assert_eq!(stepped.occlusion(slice), fresh.occlusion(other));
+        }
+    }
 }
 
 #[test]
