@@ -335,7 +335,7 @@ fn says_the_same(a: &World, b: &World) -> bool {
 #[test]
 fn a_step_with_few_rays_spends_them_where_most_has_changed() {
     let options = laid_out(options(256.0, 64), residual());
-    let mut worlds = [64, u64::MAX, u64::MAX].map(|_| world(small_scene(), options.clone()));
+    let mut worlds = [0; 3].map(|_| world(small_scene(), options.clone()));
     let off = |a: &World, b: &World| -> f64 {
         let points = |world: &World| -> Vec<u8> {
             let said = |slice| world.occlusion(slice).to_vec();
@@ -350,7 +350,7 @@ fn a_step_with_few_rays_spends_them_where_most_has_changed() {
     for step in 1..=20 {
         let time = f64::from(step) * 0.05;
         rays[1] += at_once.step(time, &all, 0).rays;
-        in_turns.options.refresh_rays = rays[1] / step as u64 / 4;
+        in_turns.options.refresh_rays = rays[1] / step as u64 / 2;
         rays[0] += in_turns.step(time, &all, 0).rays;
         // All of it, in every fourth step: as many rays.
         if step % 4 == 0 {
@@ -359,8 +359,8 @@ fn a_step_with_few_rays_spends_them_where_most_has_changed() {
         lag += off(in_turns, at_once);
         stale += off(left, at_once);
     }
-    assert!(rays[0] * 3 < rays[1], "{rays:?}");
-    assert!(lag < stale, "{lag} against {stale}");
+    assert!(rays[0] * 3 < rays[1], "{rays:?} {lag} against {stale}");
+    assert!(lag < stale, "{rays:?} {lag} against {stale}");
 }
 
 #[test]
@@ -371,15 +371,16 @@ fn points_that_face_no_eye_wait_until_they_face_one() {
     for world in [&mut whole, &mut seen] {
         converge(world);
     }
-    let above = (DVec3::new(50.2, 3.0, 0.1) - seen.scene.origin).as_vec3();
+    // The floor faces up.
+    let below = (DVec3::new(50.2, -3.0, 0.1) - seen.scene.origin).as_vec3();
     let mut rays = [0, 0];
     for step in 1..=10 {
-        seen.eyes = vec![above];
+        seen.eyes = vec![below];
         for (world, rays) in [&mut whole, &mut seen].into_iter().zip(&mut rays) {
             *rays += world.step(f64::from(step) * 0.05, &all, 0).rays;
         }
         for (slice, other) in seen.slices.iter().zip(&whole.slices) {
-            let faces = seen.facing(slice, above);
+            let faces = seen.facing(slice, below);
             let blocks = seen.occlusion(slice).chunks(BLOCK);
             for (block, pair) in blocks.zip(whole.occlusion(other).chunks(BLOCK)).enumerate() {
                 assert!(faces >> block & 1 == 0 || pair.0 == pair.1, "{block}");
