@@ -493,7 +493,7 @@ fn a_transform_that_makes_no_sense_harms_nothing_else() {
     }
     world.step(0.6, &all, u64::MAX);
     converge(&mut world);
-    let open = points(&world, small_scene::FLOOR);
+    let open = points(&world, FLOOR);
     let mut open = open.values().flatten().map(|point| point & 0xff);
     assert!(
         open.all(|occlusion| occlusion == 255),
