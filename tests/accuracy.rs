@@ -6,15 +6,18 @@
 //! cargo test -p psao-tests --test accuracy -- --nocapture --test-threads 1
 //! ```
 
-use glam::{DVec3, Quat, Vec3};
+use glam::Vec3;
 use psao::core::point::{NORMALS, decode_position};
 use psao::core::{Cell, Kernel, Lookup};
 use psao_server::args::camera_path;
 use psao_server::rays::{Against, offset_origin};
 use psao_server::render::View;
 use psao_server::samples::Samples;
-use psao_server::scene::{Instance, LocalTransform, Mesh, Node, Scene};
+use psao_server::scene::Scene;
 use psao_server::world::{Options, World};
+use scenes::{mesh, place, quad};
+
+mod scenes;
 
 /// Points per square metre and side.
 const DENSITY: f64 = 512.0;
@@ -27,47 +30,6 @@ fn world(scene: Scene, density: f64) -> World {
     let mut world = World::new(scene, options, &|_, _, _| ()).unwrap();
     world.converge(&|_| true, usize::MAX, &|_, _| ());
     world
-}
-
-fn place(scene: &mut Scene, mesh: Mesh) {
-    let node = scene.nodes.len() as u32;
-    scene.nodes.push(Node {
-        name: mesh.name.clone(),
-        parent: None,
-        local: LocalTransform::Trs {
-            translation: DVec3::ZERO,
-            rotation: Quat::IDENTITY,
-            scale: Vec3::ONE,
-        },
-        morph_weights: Vec::new(),
-    });
-    scene.instances.push(Instance {
-        name: mesh.name.clone(),
-        mesh: scene.meshes.len() as u32,
-        node,
-        skin: None,
-        moves: false,
-        deforms: false,
-    });
-    scene.meshes.push(mesh);
-}
-
-/// A parallelogram that faces `u` × `v`.
-fn quad(mesh: &mut Mesh, corner: Vec3, u: Vec3, v: Vec3) {
-    let first = mesh.positions.len() as u32;
-    mesh.positions
-        .extend([corner, corner + u, corner + v, corner + u + v]);
-    mesh.normals.extend([u.cross(v).normalize(); 4]);
-    mesh.triangles.push([first, first + 1, first + 2]);
-    mesh.triangles.push([first + 1, first + 3, first + 2]);
-}
-
-fn mesh(name: &str, double_sided: bool) -> Mesh {
-    Mesh {
-        name: name.into(),
-        double_sided,
-        ..Mesh::default()
-    }
 }
 
 // ---------------------------------------------------------------- leaks
