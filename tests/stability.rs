@@ -428,7 +428,7 @@ fn odd_row(name: &str, scene: &Scene, density: f64, ao_distance_m: f32) {
             scattered.jumps,
         );
         assert!(world.point_count() > 500, "{} points", world.point_count());
-        // `paper` has thresholds, and grids as large as the rule allows are coarse beside its radius.
+        // `paper` has thresholds, and a grid as large as the rule allows is coarse beside its r.
         assert!(traced.jumps + scattered.jumps <= FRAGMENTS / 500);
     }
 }
