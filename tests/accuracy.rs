@@ -6,15 +6,18 @@
 //! cargo test -p psao-tests --test accuracy -- --nocapture --test-threads 1
 //! ```
 
-use glam::{DVec3, Quat, Vec3};
+use glam::Vec3;
 use psao::core::point::{NORMALS, decode_position};
 use psao::core::{Cell, Kernel, Lookup};
 use psao_server::args::camera_path;
-use psao_server::rays::{Against, offset_origin};
+use psao_server::eval::convergence;
 use psao_server::render::View;
 use psao_server::samples::Samples;
-use psao_server::scene::{Instance, LocalTransform, Mesh, Node, Scene};
+use psao_server::scene::Scene;
 use psao_server::world::{Options, World};
+use scenes::{mesh, place, quad};
+
+mod scenes;
 
 /// Points per square metre and side.
 const DENSITY: f64 = 512.0;
@@ -27,47 +30,6 @@ fn world(scene: Scene, density: f64) -> World {
     let mut world = World::new(scene, options, &|_, _, _| ()).unwrap();
     world.converge(&|_| true, usize::MAX, &|_, _| ());
     world
-}
-
-fn place(scene: &mut Scene, mesh: Mesh) {
-    let node = scene.nodes.len() as u32;
-    scene.nodes.push(Node {
-        name: mesh.name.clone(),
-        parent: None,
-        local: LocalTransform::Trs {
-            translation: DVec3::ZERO,
-            rotation: Quat::IDENTITY,
-            scale: Vec3::ONE,
-        },
-        morph_weights: Vec::new(),
-    });
-    scene.instances.push(Instance {
-        name: mesh.name.clone(),
-        mesh: scene.meshes.len() as u32,
-        node,
-        skin: None,
-        moves: false,
-        deforms: false,
-    });
-    scene.meshes.push(mesh);
-}
-
-/// A parallelogram that faces `u` × `v`.
-fn quad(mesh: &mut Mesh, corner: Vec3, u: Vec3, v: Vec3) {
-    let first = mesh.positions.len() as u32;
-    mesh.positions
-        .extend([corner, corner + u, corner + v, corner + u + v]);
-    mesh.normals.extend([u.cross(v).normalize(); 4]);
-    mesh.triangles.push([first, first + 1, first + 2]);
-    mesh.triangles.push([first + 1, first + 3, first + 2]);
-}
-
-fn mesh(name: &str, double_sided: bool) -> Mesh {
-    Mesh {
-        name: name.into(),
-        double_sided,
-        ..Mesh::default()
-    }
 }
 
 // ---------------------------------------------------------------- leaks
@@ -344,84 +306,24 @@ fn still_pixels_do_not_shimmer_and_moving_ones_lag_little() {
 
 #[test]
 fn stratified_rays_converge_faster_than_independent_ones() {
-    let world = world(Scene::atrium(), 2.0);
-    let full = Samples::new(4096);
-    let mut places = Vec::new();
-    for slice in world.slices.iter() {
-        for number in slice.points.clone().step_by(4) {
-            let index = slice.instance as usize;
-            let (position, normal) = world.grid_point(slice.instance, number);
-            let pose = &world.pose.instances[index];
-            let normal = pose.world_normal(normal);
-            let position = pose.world_from_local.transform_point3(position);
-            let origin = offset_origin(position, normal, world.reach(slice.instance));
-            places.push((number, origin, normal));
-        }
-    }
-    // SplitMix64: the same on every machine.
-    let mut state = 5u64;
-    let mut random = || {
-        state = state.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut x = state;
-        x = (x ^ x >> 30).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        x = (x ^ x >> 27).wrapping_mul(0x94d0_49bb_1331_11eb);
-        ((x ^ x >> 31) >> 40) as f32 / (1 << 24) as f32
+    let options = Options {
+        density: 2.0,
+        rest_space: true,
+        ..Options::of(Kernel::Planar)
     };
-    let open = |origin: Vec3, directions: &[Vec3]| -> Vec<bool> {
-        let mut hit = vec![0u64; directions.len().div_ceil(64)];
-        let todo = vec![u64::MAX; hit.len()];
-        let t_max = world.options.ao_distance_m;
-        let tracer = world.tracer();
-        tracer.occluded(Against::All, origin, directions, t_max, &todo, &mut hit);
-        (0..directions.len())
-            .map(|i| hit[i / 64] >> (i % 64) & 1 == 0)
-            .collect()
-    };
-    let counts = [16usize, 64, 256, 1024];
-    let mut squares = [[0.0f64; 4]; 2];
-    let mut directions = vec![Vec3::ZERO; 4096];
-    let mut partly = 0;
-    for &(number, origin, normal) in &places {
-        let share = |open: &[bool]| open.iter().filter(|o| **o).count() as f64 / open.len() as f64;
-        // The truth is of another set than what is compared with it.
-        full.directions(
-            number.wrapping_add(77_777),
-            normal,
-            Vec3::X,
-            &mut directions,
-        );
-        let exact = share(&open(origin, &directions));
-        if exact == 0.0 || exact == 1.0 {
-            continue;
-        }
-        partly += 1;
-        full.directions(number, normal, Vec3::X, &mut directions);
-        let stratified = open(origin, &directions);
-        let [u, v] = <[Vec3; 2]>::from(normal.any_orthonormal_pair());
-        let alone: Vec<Vec3> = (0..1024)
-            .map(|_| {
-                let (a, b) = (random(), random() * std::f32::consts::TAU);
-                (u * b.cos() + v * b.sin()) * a.sqrt() + normal * (1.0 - a).sqrt()
-            })
-            .collect();
-        let independent = open(origin, &alone);
-        for (k, &count) in counts.iter().enumerate() {
-            squares[0][k] += (share(&stratified[..count]) - exact).powi(2);
-            squares[1][k] += (share(&independent[..count]) - exact).powi(2);
-        }
-    }
-    assert!(
-        partly > 100,
-        "{partly} places that are neither open nor closed"
-    );
-    let rms = squares.map(|row| row.map(|sum| (sum / f64::from(partly)).sqrt() * 255.0));
+    let world = World::new(Scene::atrium(), options, &|_, _, _| ()).unwrap();
+    let found = convergence::measure(&world).unwrap();
     println!("| rays | stratified, 1/255 rms | independent |");
     println!("|---|---|---|");
-    for (k, count) in counts.iter().enumerate() {
-        println!("| {count} | {:.3} | {:.3} |", rms[0][k], rms[1][k]);
+    for row in &found.rows {
+        let (stratified, independent) = (row.stratified_255, row.independent_255);
+        println!("| {} | {stratified:.3} | {independent:.3} |", row.rays);
     }
-    let slope = |row: [f64; 4]| (row[3] / row[0]).log2() / (counts[3] as f64 / 16.0).log2();
-    let [stratified, independent] = rms.map(slope);
-    println!("slopes: stratified {stratified:.2}, independent {independent:.2}");
-    assert!(stratified < -0.6 && (-0.55..-0.45).contains(&independent));
+    let [stratified, independent] = [found.slope_stratified, found.slope_independent];
+    println!(
+        "slopes: stratified {stratified:.2}, independent {independent:.2}, {} points",
+        found.points
+    );
+    assert!(found.points > 100 && stratified < -0.6);
+    assert!((-0.55..-0.45).contains(&independent), "{independent}");
 }

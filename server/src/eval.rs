@@ -5,6 +5,7 @@
 //! one world, so they differ in nothing but the quantiser. The two profiles need a world each (one
 //! in rest space), which trace the same rays along the same camera path.
 
+pub mod convergence;
 pub mod kernels;
 mod variants;
 

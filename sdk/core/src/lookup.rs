@@ -117,6 +117,14 @@ impl Lookup<'_> {
     /// instances without points, positions outside the grid and non-finite input answer 1; a zero
     /// normal agrees with no point, so `Paper` answers 1 and `Planar` blends by distance alone.
     pub fn blend(&self, kernel: Kernel, instance: u32, position: Vec3, normal: Vec3) -> Answer {
+        // Chosen once, so that no point asks again.
+        match kernel {
+            Kernel::Paper => self.blend_by::<Paper>(instance, position, normal),
+            Kernel::Planar => self.blend_by::<Planar>(instance, position, normal),
+        }
+    }
+
+    fn blend_by<W: Weigh>(&self, instance: u32, position: Vec3, normal: Vec3) -> Answer {
         let Some(grid) = self.instances.get(instance as usize) else {
             return Answer::OPEN;
         };
@@ -134,12 +142,15 @@ impl Lookup<'_> {
             if !(g[axis] >= -0.5 && g[axis] < grid.dims[axis] as f32 + 0.5) {
                 return Answer::OPEN;
             }
-            let lower = libm::floorf(g[axis] - 0.5);
-            base[axis] = lower as i32;
-            place[axis] = g[axis] - lower;
+            // The floor, without a call.
+            let shifted = g[axis] - 0.5;
+            let whole = shifted as i32;
+            base[axis] = whole - i32::from(whole as f32 > shifted);
+            place[axis] = g[axis] - base[axis] as f32;
         }
-        let mut blend = Blend::new(kernel, grid.radius, normal);
+        let kernel = W::new(grid.radius, normal);
         let sides = place.map(sides);
+        let mut blended = Blended::default();
         for corner in 0..8i32 {
             let offset = [corner & 1, corner >> 1 & 1, corner >> 2];
             // −1 becomes a large number: below the grid is out of range too.
@@ -151,20 +162,29 @@ impl Lookup<'_> {
                 continue;
             };
             let from = core::array::from_fn(|axis| offset[axis] as f32 - place[axis]);
+            let of_cell = Blended::of_cell(&kernel, found, from);
             let side = (0..3).fold(1.0, |side, axis| side * sides[axis][offset[axis] as usize]);
-            blend.add_cell(found, from, side);
+            blended.add(of_cell, if W::FADES { side } else { 1.0 });
         }
-        blend.answer()
+        blended.answer::<W>()
     }
 
     /// The cell at a grid coordinate: hash, then search its bucket for the key.
     pub fn find(&self, grid: &Instance, cell: [u32; 3]) -> Option<&Cell> {
         let key = grid.key(cell);
         let bucket = self.buckets.get(grid.bucket(cell) as usize)?;
-        bucket.cells().find_map(|entry| {
-            let cell = self.cells.get(entry as usize)?;
-            (cell.key == key).then_some(cell)
-        })
+        // A loop, not iterators: those are not inlined, and this is a quarter of a lookup.
+        for &entry in &bucket.entries {
+            if entry == 0 {
+                break;
+            }
+            if let Some(cell) = self.cells.get(entry as usize)
+                && cell.key == key
+            {
+                return Some(cell);
+            }
+        }
+        None
     }
 }
 
@@ -193,95 +213,126 @@ fn to_cell_space(normal: Vec3, grid: &Instance) -> Option<Vec3> {
     Some([n[0] * scale, n[1] * scale, n[2] * scale])
 }
 
-/// How much a point of this openness counts for [`Kernel::Planar`].
-fn seen(openness: f32) -> f32 {
-    (openness * (1.0 / SEEN)).min(1.0) + UNSEEN
+/// A kernel, for one fragment.
+trait Weigh {
+    /// Cells fade before the block leaves them.
+    const FADES: bool;
+
+    /// `radius` in cells; a unit normal in cell space, or zero.
+    fn new(radius: f32, normal: Vec3) -> Self;
+
+    /// The weight of a point at `d` from the fragment; `occlusion` as points have it, 0 to 255.
+    fn weight(&self, d: Vec3, point_normal: Vec3, occlusion: f32) -> f32;
+
+    /// The part of a weight that says how open a point is, not how near.
+    fn seen(occlusion: f32) -> f32;
 }
 
-struct Blend {
-    kernel: Kernel,
+/// Eq. 2 and 3.
+struct Paper {
     normal: Vec3,
     radius: f32,
-    inverse_radius_squared: f32,
-    weight: f32,
-    sum: f32,
-    fetched: u32,
 }
 
-impl Blend {
-    fn new(kernel: Kernel, radius: f32, normal: Vec3) -> Blend {
-        Blend {
-            kernel,
-            normal,
-            radius,
-            // Finite, so that a point right at the fragment is at distance 0 for any radius.
-            inverse_radius_squared: (1.0 / (radius * radius)).min(f32::MAX),
-            weight: 0.0,
-            sum: 0.0,
-            fetched: 0,
-        }
+impl Weigh for Paper {
+    const FADES: bool = false;
+
+    fn new(radius: f32, normal: Vec3) -> Paper {
+        Paper { normal, radius }
     }
 
-    /// Adds a cell's points; `from` is the vector from the fragment to the cell's lower corner,
-    /// `side` the cell's part.
-    fn add_cell(&mut self, cell: &Cell, from: Vec3, side: f32) {
-        for point in cell.points() {
-            let step = point.position();
-            let d: Vec3 = core::array::from_fn(|axis| from[axis] + decode_position(step[axis]));
-            let point_normal = NORMALS[point.normal() as usize];
-            let openness = f32::from(point.occlusion()) * (1.0 / 255.0);
-            let squared = dot(d, d);
-            self.fetched += 1;
-            let weight = match self.kernel {
-                Kernel::Paper => self.paper(d, squared, point_normal),
-                Kernel::Planar => side * seen(openness) * self.planar(d, squared, point_normal),
-            };
-            self.weight += weight;
-            self.sum += weight * openness;
-        }
-    }
-
-    /// Eq. 2 and 3.
-    fn paper(&self, d: Vec3, squared: f32, point_normal: Vec3) -> f32 {
-        let distance = libm::sqrtf(squared);
+    fn weight(&self, d: Vec3, point_normal: Vec3, _: f32) -> f32 {
+        let squared = dot(d, d);
         let along = dot(point_normal, d);
         if dot(point_normal, self.normal) <= T_N || along * along >= T_D * squared && squared > 0.0
         {
             return 0.0;
         }
-        ((self.radius - distance) / self.radius).max(0.0)
+        ((self.radius - libm::sqrtf(squared)) / self.radius).max(0.0)
     }
 
-    fn planar(&self, d: Vec3, squared: f32, point_normal: Vec3) -> f32 {
+    fn seen(_: f32) -> f32 {
+        1.0
+    }
+}
+
+struct Planar {
+    normal: Vec3,
+    inverse_radius_squared: f32,
+}
+
+impl Weigh for Planar {
+    const FADES: bool = true;
+
+    fn new(radius: f32, normal: Vec3) -> Planar {
+        Planar {
+            normal,
+            // Finite, so that a point right at the fragment is at distance 0 for any radius.
+            inverse_radius_squared: (1.0 / (radius * radius)).min(f32::MAX),
+        }
+    }
+
+    fn weight(&self, d: Vec3, point_normal: Vec3, occlusion: f32) -> f32 {
         let agree = dot(point_normal, self.normal).max(T_N);
         let h = dot(self.normal, d).abs().max(dot(point_normal, d).abs());
-        let far = CORE + (squared + FLATNESS * (h * h)) * self.inverse_radius_squared;
+        let far = CORE + (dot(d, d) + FLATNESS * (h * h)) * self.inverse_radius_squared;
         let agree2 = agree * agree;
         let agree4 = agree2 * agree2;
-        agree4 * agree4 / (far * far)
+        Self::seen(occlusion) * (agree4 * agree4) / (far * far)
+    }
+
+    fn seen(occlusion: f32) -> f32 {
+        (occlusion * (1.0 / (255.0 * SEEN))).min(1.0) + UNSEEN
+    }
+}
+
+/// What points come to: sums over them.
+#[derive(Clone, Copy, Default)]
+struct Blended {
+    weight: f32,
+    /// Of weight times occlusion, 0 to 255.
+    sum: f32,
+    fetched: u32,
+}
+
+impl Blended {
+    /// A cell's points; `from` is the vector from the fragment to the cell's lower corner.
+    fn of_cell<W: Weigh>(kernel: &W, cell: &Cell, from: Vec3) -> Blended {
+        let mut blended = Blended::default();
+        for point in cell.points() {
+            let step = point.position();
+            let d: Vec3 = core::array::from_fn(|axis| from[axis] + decode_position(step[axis]));
+            let occlusion = f32::from(point.occlusion());
+            let weight = kernel.weight(d, NORMALS[point.normal() as usize], occlusion);
+            blended.weight += weight;
+            blended.sum += weight * occlusion;
+            blended.fetched += 1;
+        }
+        blended
+    }
+
+    /// Adds what a cell comes to, of which `side` counts.
+    fn add(&mut self, cell: Blended, side: f32) {
+        self.weight += side * cell.weight;
+        self.sum += side * cell.sum;
+        self.fetched += cell.fetched;
     }
 
     /// Eq. 4.
-    fn answer(&self) -> Answer {
-        if self.weight <= 0.0 {
-            return Answer {
-                fetched: self.fetched,
-                ..Answer::OPEN
-            };
-        }
-        // The quotient of two sums may round past the largest value blended.
-        let openness = (self.sum / self.weight).min(1.0);
-        // Dark points weigh less, but are as near.
-        let seen = match self.kernel {
-            Kernel::Paper => 1.0,
-            Kernel::Planar => seen(openness),
-        };
-        Answer {
-            openness,
+    fn answer<W: Weigh>(&self) -> Answer {
+        let mut answer = Answer {
             weight: self.weight,
             fetched: self.fetched,
-            near: (self.weight / (NEAR * seen)).min(1.0),
+            ..Answer::OPEN
+        };
+        if self.weight > 0.0 {
+            let occlusion = self.sum / self.weight;
+            // The quotient of two sums may round past the largest value blended.
+            answer.openness = (occlusion * (1.0 / 255.0)).min(1.0);
+            // Dark points weigh less, but are as near.
+            answer.near = (self.weight / (NEAR * W::seen(occlusion))).min(1.0);
         }
+        answer
     }
 }
 

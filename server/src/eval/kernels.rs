@@ -5,11 +5,12 @@
 //! each variant here, so that capacities and kernels can be tried which no stream has. Pictures
 //! are ray traced once and shared by all variants.
 
+use super::convergence::{self, Convergence};
 use super::variants::{
     Band, Blended, Facing, Grids, LeastSquares, Mean, Paper, Planar, Sample, Samples as SetSamples,
     Weigh,
 };
-use super::{EvalArgs, mean, ms, percentile};
+use super::{EvalArgs, mean, percentile};
 use crate::args::{PlacementArg, SceneArgs, camera_path};
 use crate::metrics::Pair;
 use crate::picture::{Picture, write_whole};
@@ -22,6 +23,7 @@ use psao_core::cell::CELL_POINTS;
 use rayon::prelude::*;
 use serde::Serialize;
 use std::collections::HashSet;
+use std::hint::black_box;
 use std::str::FromStr;
 use std::time::Instant;
 
@@ -128,7 +130,7 @@ pub struct Row {
     pub holes_share: f64,
     /// Points read a pixel.
     pub fetched: f64,
-    /// Nanoseconds a lookup, on one thread.
+    /// Nanoseconds a lookup, on one thread, in turns with the other variants of the same points.
     pub lookup_ns: f64,
     /// Share of the points that found no room.
     pub discarded_share: f64,
@@ -147,6 +149,8 @@ pub struct Found {
     pub size: (usize, usize),
     /// One a variant.
     pub rows: Vec<Row>,
+    /// What rays a point are worth; of the first density and placement.
+    pub convergence: Option<Convergence>,
     /// Pictures of errors.
     #[serde(skip)]
     panels: Vec<Panel>,
@@ -158,6 +162,9 @@ struct Shot {
     view: View,
     reference: Vec<f32>,
 }
+
+/// A variant's lookup at some fragments of a picture: the sum of its answers.
+type Timed = Box<dyn Fn(&[&Fragment]) -> f32>;
 
 /// Places on both sides of a block's switch, in the grid's space.
 const SEAM_SHARE: usize = 3;
@@ -200,6 +207,7 @@ pub fn run(args: &EvalArgs, progress: Progress<'_>) -> Result<Found, String> {
             let mut world = world.map_err(|error| error.to_string())?;
             if shots.is_empty() {
                 shots = take(&mut world, args, progress)?;
+                found.convergence = convergence::measure(&world);
             }
             let name = match placement {
                 PlacementArg::Uniform => "uniform",
@@ -326,15 +334,50 @@ fn measure_all(
         .iter()
         .map(|shot| points_of(world, shot, progress))
         .collect();
+    let first = found.rows.len();
+    let mut timed: Vec<Vec<Timed>> = shots.iter().map(|_| Vec::new()).collect();
     for variant in &args.kernels {
         for capacity in args.capacities.iter().map(|&c| usize::from(c)) {
             let row = match capacity <= CELL_POINTS {
-                true => sized::<CELL_POINTS>(world, shots, &points, variant, capacity, found),
-                false => sized::<15>(world, shots, &points, variant, capacity, found),
+                true => sized::<CELL_POINTS>(
+                    world, shots, &points, variant, capacity, &mut timed, found,
+                ),
+                false => sized::<15>(world, shots, &points, variant, capacity, &mut timed, found),
             };
             found.rows.push(Row { placement, ..row });
         }
     }
+    let nanoseconds = side_by_side(shots, &timed);
+    for (row, lookup_ns) in found.rows[first..].iter_mut().zip(nanoseconds) {
+        row.lookup_ns = lookup_ns;
+    }
+}
+
+/// Nanoseconds a lookup of each variant: run by run of fragments, all variants take turns, and of
+/// each the least counts. What else the machine does, and how fast it runs just now, so troubles
+/// none more than another. Runs are warm: what a variant reads is in the cache if there is room.
+fn side_by_side(shots: &[Shot], timed: &[Vec<Timed>]) -> Vec<f64> {
+    const RUN: usize = 1024;
+    const ROUNDS: usize = 9;
+    let mut sums = vec![0.0; timed.first().map_or(0, Vec::len)];
+    let mut count = 0;
+    for (shot, timed) in shots.iter().zip(timed) {
+        let fragments: Vec<&Fragment> = shot.view.fragments.iter().flatten().collect();
+        count += fragments.len();
+        for run in fragments.chunks(RUN) {
+            let mut least = vec![f64::INFINITY; sums.len()];
+            for _ in 0..ROUNDS {
+                for (least, blend) in least.iter_mut().zip(timed) {
+                    let start = Instant::now();
+                    black_box(blend(run));
+                    *least = least.min(start.elapsed().as_secs_f64());
+                }
+            }
+            sums.iter_mut().zip(least).for_each(|(sum, s)| *sum += s);
+        }
+    }
+    let each = 1e9 / count.max(1) as f64;
+    sums.into_iter().map(|sum| sum * each).collect()
 }
 
 fn sized<const N: usize>(
@@ -343,6 +386,7 @@ fn sized<const N: usize>(
     points: &[Vec<SetSamples>],
     variant: &Variant,
     capacity: usize,
+    timed: &mut [Vec<Timed>],
     found: &mut Found,
 ) -> Row {
     let go = match variant.name {
@@ -354,25 +398,26 @@ fn sized<const N: usize>(
         Name::PlanarDark => measure::<Mean<Planar<true, false>>, N>,
         Name::LeastSquares => measure::<LeastSquares, N>,
     };
-    go(world, shots, points, variant, capacity, found)
+    go(world, shots, points, variant, capacity, timed, found)
 }
 
-fn measure<K: Weigh, const N: usize>(
+fn measure<K: Weigh + 'static, const N: usize>(
     world: &World,
     shots: &[Shot],
     points: &[Vec<SetSamples>],
     variant: &Variant,
     capacity: usize,
+    timed: &mut [Vec<Timed>],
     found: &mut Found,
 ) -> Row {
     let options = &world.options;
     let rm = crate::points::largest_radius(options.density) as f32;
     let cell_m = rm * variant.radius_over_rm * variant.cell_over_radius;
     let (mut squares, mut pixels, mut holes, mut fetched) = (0.0, 0.0, 0.0, 0.0);
-    let (mut flip, mut ssim, mut nanoseconds) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut flip, mut ssim) = (Vec::new(), Vec::new());
     let (mut steps, mut discarded, mut placed) = (Vec::new(), 0, 0);
     let mut pictures = Vec::new();
-    for (shot, points) in shots.iter().zip(points) {
+    for ((shot, points), timed) in shots.iter().zip(points).zip(timed) {
         let grids = Grids::<N>::new(
             world.scene.instances.len(),
             points,
@@ -384,16 +429,7 @@ fn measure<K: Weigh, const N: usize>(
         placed += grids.points;
         let fragments: Vec<_> = shot.view.fragments.iter().flatten().collect();
         let blend = |f: &Fragment| grids.blend::<K>(f.instance, f.position, f.normal);
-        let mut answers: Vec<Blended> = Vec::new();
-        let mut times = Vec::new();
-        for _ in 0..5 {
-            answers.clear();
-            answers.reserve(fragments.len());
-            let start = Instant::now();
-            answers.extend(fragments.iter().map(|f| blend(f)));
-            times.push(ms(start) * 1e6 / fragments.len().max(1) as f64);
-        }
-        nanoseconds.push(percentile(&times, 0.5));
+        let answers: Vec<Blended> = fragments.par_iter().map(|f| blend(f)).collect();
         let facing = |f: &&Fragment| grids.blend::<Facing>(f.instance, f.position, f.normal).hole;
         holes += match variant.name {
             Name::Paper | Name::PaperNearest => answers.iter().filter(|a| a.hole).count(),
@@ -404,6 +440,13 @@ fn measure<K: Weigh, const N: usize>(
         let test: Vec<f32> = (shot.view.fragments.iter())
             .map(|f| f.map_or(1.0, |_| next.next().map_or(1.0, |a| a.openness)))
             .collect();
+        let every: Vec<_> = fragments.iter().step_by(SEAM_SHARE).collect();
+        let at_switches = every.par_iter().filter_map(|f| step::<K, N>(&grids, f));
+        steps.extend(at_switches.collect::<Vec<f64>>());
+        timed.push(Box::new(move |fragments| {
+            let one = |f: &&Fragment| grids.blend::<K>(f.instance, f.position, f.normal).openness;
+            fragments.iter().map(one).sum()
+        }));
         let (width, height) = (shot.view.width, shot.view.height);
         let valid = shot.view.valid();
         let Ok(pair) = Pair::new(&shot.reference, &test, &valid, width, height) else {
@@ -414,9 +457,6 @@ fn measure<K: Weigh, const N: usize>(
         pixels += count;
         flip.push(pair.flip());
         ssim.push(pair.ssim());
-        let every: Vec<_> = fragments.iter().step_by(SEAM_SHARE).collect();
-        let at_switches = every.par_iter().filter_map(|f| step::<K, N>(&grids, f));
-        steps.extend(at_switches.collect::<Vec<f64>>());
         let error: Vec<f32> = test
             .iter()
             .zip(&shot.reference)
@@ -441,7 +481,7 @@ fn measure<K: Weigh, const N: usize>(
         seam_p99: percentile(&steps, 0.99),
         holes_share: holes / pixels,
         fetched: fetched / pixels,
-        lookup_ns: mean(&nanoseconds),
+        lookup_ns: 0.0,
         discarded_share: discarded as f64 / placed.max(1) as f64,
         points: world.point_count(),
     };
@@ -561,7 +601,7 @@ impl Found {
             title: format!("PSAO eval, kernels: {scene}"),
             summary: Vec::new(),
             panels: self.panels.clone(),
-            plots: vec![
+            plots: [
                 Plot {
                     title: "Error against time: every variant".into(),
                     form: Form::Marks,
@@ -571,7 +611,10 @@ impl Found {
                     title: "Error against time: what no other betters in both".into(),
                     ..plot(vec![("Pareto line".into(), best)])
                 },
-            ],
+            ]
+            .into_iter()
+            .chain(self.convergence.as_ref().map(Convergence::plot))
+            .collect(),
         }
     }
 }
