@@ -212,12 +212,9 @@ fn frames_that_are_lost_or_mixed_are_noticed_even_where_the_sequence_is_right() 
     let lost_last = read_changed(&|list| drop(list.remove(5)));
     assert_eq!(lost_last.error, order);
     let lost_frame = read_changed(&|list| drop(list.remove(6)));
-    assert_eq!(
-        (lost_frame.shown.len(), lost_frame.error),
-        (1, order.clone())
-    );
+    assert_eq!((lost_frame.shown.len(), lost_frame.error), (1, order));
     let repeated = read_changed(&|list| list.insert(6, list[6].clone()));
-    assert_eq!((repeated.shown.len(), repeated.error), (2, order.clone()));
+    assert_eq!((repeated.shown.len(), repeated.error), (2, order));
     let end_within = read_changed(&|list| list.swap(5, 8));
     assert_eq!(end_within.error, order);
     let snapshot_within = read_changed(&|list| list[3].1 |= flag::SNAPSHOT);
