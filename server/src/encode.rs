@@ -24,11 +24,8 @@ use psao_core::stream::{
     Writer, flag, kind, write_packet,
 };
 use psao_core::{Bucket, Cell, Instance, Mirror};
-<<<<<<< HEAD
-use std::time::Instant;
-=======
 use rayon::prelude::*;
->>>>>>> refs/heads/send
+use std::time::Instant;
 use zstd::zstd_safe::{CCtx, CParameter, Strategy, compress_bound};
 
 /// How a stream carries changes.

@@ -522,18 +522,7 @@ impl Residual {
                 let opens = self.open(world, lack.index, out);
                 ready.extend(opens.map(|opens| (lack, Some(opens))));
             } else {
-<<<<<<< HEAD
-                ready.push((lack.index, None));
-=======
-                let slice = slice(lack);
-                let level = self.mirror.instances()[slice.instance as usize].level;
-                let neighbours = world.topology.neighbours(slice.patch, level, false);
-                let mut slices = self.heap.slices();
-                slices
-                    .prepare(&self.mirror, lack.index, Some(neighbours))
-                    .expect("own slices are open");
                 ready.push((lack, None));
->>>>>>> refs/heads/send
             }
         }
         let coded: Vec<Coded> = ready
