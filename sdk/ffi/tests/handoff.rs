@@ -77,6 +77,32 @@ fn what_the_reader_marks_when_it_lets_go_is_there_for_the_writer() {
 }
 
 #[test]
+fn what_is_taken_again_is_whole_and_no_older() {
+    loom::model(|| {
+        let shared = Arc::new(Handoff::new(Pair::default()));
+        assert!(shared.write(|pair| *pair = Pair(1, 1)).is_some() && shared.take());
+        assert!(shared.release(|_| ()));
+        let writer = {
+            let shared = Arc::clone(&shared);
+            loom::thread::spawn(move || shared.write(|pair| *pair = Pair(2, 2)).is_some())
+        };
+        // Not while it is written.
+        if shared.take_again() {
+            let mut seen = (0, 0);
+            assert!(shared.change(|pair| seen = (pair.0, pair.1)));
+            assert!(
+                seen.0 == seen.1 && (1..=2).contains(&seen.0),
+                "half a write"
+            );
+            assert!(shared.release(|_| ()));
+        }
+        let wrote = writer.join().unwrap();
+        assert!(shared.take_again());
+        assert_eq!(shared.taken(|pair| pair.0), Some(if wrote { 2 } else { 1 }));
+    });
+}
+
+#[test]
 fn nothing_is_recalled_while_the_reader_has_it() {
     loom::model(|| {
         let shared = Arc::new(Handoff::new(Pair::default()));
