@@ -14,6 +14,7 @@ pub fn unless_it_panics<R>(body: impl FnOnce() -> R) -> Option<R> {
 #[cfg(panic = "abort")]
 pub use jump::unless_it_panics;
 
+/// cbindgen:ignore
 #[cfg(panic = "abort")]
 mod jump {
     use core::ffi::c_void;
