@@ -250,7 +250,7 @@ fn a_c_program_connects_plays_what_comes_and_is_heard() {
     let program = folder.path().join("connect");
     run(Command::new("cc")
         .args(WARNINGS)
-        .arg("-std=c99")
+        .args(["-std=c99", "-DPSAO_QUIC"])
         .arg("-I")
         .arg(root().join("include"))
         .arg(root().join("tests/c/connect.c"))

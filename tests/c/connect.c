@@ -1,7 +1,6 @@
 /* The optional transport: connects, plays what comes, and says so. Arguments: address,
  * fingerprint, token, and the stream that the server will send, for its config. */
 #define _POSIX_C_SOURCE 200809L
-#define PSAO_QUIC
 #include "common.h"
 #include <time.h>
 
