@@ -429,10 +429,6 @@ uint32_t psao_version(void);
  * Threads: any. No alloc, lock or log. Since ABI 1. */
 uint32_t psao_abi_version(void);
 
-extern void psao_guard_run(void (*run)(void*), void *argument);
-
-extern void psao_guard_leave(void);
-
 /* Fills a config with just what a stream needs, from its first bytes: of a recording, or of what
  * a server sends. Zeroes the rest of it but struct_size.
  *
