@@ -1622,7 +1622,7 @@ const BLOCK_RAYS: u32 = 128;
 
 /// How fast what points say is taken to change, in 1/255 a step: at the least, as what moves may
 /// come nearer; and as long as nobody has looked, or what moves has only now come within reach.
-const LEAST_RATE: f32 = 0.5;
+const LEAST_RATE: f32 = 0.1;
 const NEW_RATE: f32 = 4.0;
 
 /// More than this says no more about what is urgent, 1/255.
