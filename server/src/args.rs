@@ -2,6 +2,8 @@
 
 use crate::camera::CameraPath;
 use crate::encode::{Compression, Limits, Scheme};
+#[cfg(feature = "gpu")]
+use crate::gpu::trace::StillTracer;
 use crate::points::SurfacePoint;
 use crate::rays::Tracer;
 use crate::scene::{Placement, Pose, Scene};
@@ -86,6 +88,54 @@ pub enum ProfileArg {
     Cells,
     /// Where points are once, then occlusion alone, predicted and entropy coded
     Residual,
+}
+
+/// What traces rays, by name.
+#[derive(ValueEnum, Clone, Copy, Debug, PartialEq, Eq)]
+pub enum DeviceArg {
+    /// All rays on the processor
+    Cpu,
+    /// Rays between things that stand still on a GPU with Vulkan, the others on the processor
+    Gpu,
+}
+
+/// What traces rays.
+#[derive(Args, Clone, Debug)]
+pub struct TraceArgs {
+    /// What traces rays; gpu wants a build with --features gpu
+    #[arg(long, value_enum, value_name = "DEVICE", default_value_t = DeviceArg::Cpu)]
+    pub trace: DeviceArg,
+}
+
+impl TraceArgs {
+    /// Loads the scene and places its points, and has their rays traced as asked for.
+    ///
+    /// # Errors
+    /// What is wrong with a file or an option, or that there is no GPU, and what to do.
+    pub fn world(
+        &self,
+        scene: &SceneArgs,
+        rest_space: bool,
+        progress: Progress<'_>,
+    ) -> Result<World, String> {
+        #[cfg(not(feature = "gpu"))]
+        if self.trace == DeviceArg::Gpu {
+            return Err(
+                "--trace gpu: this psao was built without its GPU parts: build it again with \
+                 --features gpu, or leave --trace away"
+                    .into(),
+            );
+        }
+        let mut world = scene.world(rest_space, progress)?;
+        #[cfg(feature = "gpu")]
+        if self.trace == DeviceArg::Gpu {
+            let (pose, rays) = (&world.pose, world.options.rays);
+            let device = StillTracer::open(&world.scene, pose, rays, world.moves());
+            let device = device.map_err(|error| format!("--trace gpu: {error}"))?;
+            world.trace_still_on(Box::new(device));
+        }
+        Ok(world)
+    }
 }
 
 impl ProfileArg {

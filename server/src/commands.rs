@@ -1,6 +1,6 @@
 //! `psao serve`, `record`, `play` and `inspect`.
 
-use crate::args::{SceneArgs, StreamArgs, camera_path};
+use crate::args::{SceneArgs, StreamArgs, TraceArgs, camera_path};
 use crate::camera::Frustum;
 use crate::encode::{Encoder, Eye, View, least_capacity};
 use crate::identity::Identity;
@@ -32,6 +32,9 @@ pub struct ServeArgs {
     /// The stream.
     #[command(flatten)]
     pub stream: StreamArgs,
+    /// What traces rays.
+    #[command(flatten)]
+    pub trace: TraceArgs,
     /// Address and UDP port to listen on
     #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:4433")]
     pub listen: SocketAddr,
@@ -58,6 +61,9 @@ pub struct RecordArgs {
     /// The stream.
     #[command(flatten)]
     pub stream: StreamArgs,
+    /// What traces rays.
+    #[command(flatten)]
+    pub trace: TraceArgs,
     /// The recording to write
     #[arg(value_name = "FILE.psao")]
     pub out: PathBuf,
@@ -115,7 +121,7 @@ pub fn serve(args: &ServeArgs, out: &mut dyn Write, progress: Progress<'_>) -> R
     let settings = args.stream.settings()?;
     let identity = Identity::load_or_create(&args.identity).map_err(|e| e.to_string())?;
     let fingerprint = identity.fingerprint();
-    let world = args.scene.world(args.stream.rest_space(), progress)?;
+    let world = (args.trace).world(&args.scene, args.stream.rest_space(), progress)?;
     let mut server = Server::new(world, settings);
     let mut transport = Transport::start(TransportConfig {
         listen: args.listen,
@@ -194,7 +200,7 @@ fn record_to(
     error: &dyn Fn(std::io::Error) -> String,
 ) -> Result<u64, String> {
     let settings = args.stream.settings()?;
-    let mut world = args.scene.world(args.stream.rest_space(), progress)?;
+    let mut world = (args.trace).world(&args.scene, args.stream.rest_space(), progress)?;
     let path = args
         .path
         .map(|which| camera_path(&world, which, 16.0 / 9.0))

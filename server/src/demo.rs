@@ -1,6 +1,6 @@
 //! The main job: server and client over loopback QUIC in one process, pictures and a report.
 
-use crate::args::{SceneArgs, StreamArgs, camera_path};
+use crate::args::{SceneArgs, StreamArgs, TraceArgs, camera_path};
 use crate::camera::{CameraPath, Frustum};
 use crate::encode::capacity_of;
 use crate::identity::Identity;
@@ -31,6 +31,9 @@ pub struct DemoArgs {
     /// The stream.
     #[command(flatten)]
     pub stream: StreamArgs,
+    /// What traces rays.
+    #[command(flatten)]
+    pub trace: TraceArgs,
     /// Server frames to stream
     #[arg(long, value_name = "N", default_value_t = 60)]
     pub frames: u32,
@@ -167,7 +170,7 @@ pub fn run(args: &DemoArgs, progress: Progress<'_>) -> Result<Figures, String> {
             .map_err(|error| format!("{}: {error}: choose another place for it", path.display()))?;
     }
     let start = Instant::now();
-    let mut world = args.scene.world(args.stream.rest_space(), progress)?;
+    let mut world = (args.trace).world(&args.scene, args.stream.rest_space(), progress)?;
     let aspect = args.size.0 as f32 / args.size.1 as f32;
     let path = camera_path(&world, args.path, aspect)?;
     let time_of = |frame: u32| f64::from(frame) / f64::from(args.stream.fps);

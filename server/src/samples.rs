@@ -84,7 +84,9 @@ impl Samples {
                 let (sin, cos) = (b * TAU).sin_cos();
                 Vec3::new(cos * a.sqrt(), sin * a.sqrt(), (1.0 - a).sqrt())
             };
-            Directions::new(&(0..rays).map(direction).collect::<Vec<Vec3>>())
+            let mut directions = Directions::new(&(0..rays).map(direction).collect::<Vec<_>>());
+            directions.set = set as u32;
+            directions
         };
         Samples {
             rays,
@@ -114,13 +116,16 @@ impl Samples {
         }
     }
 
-    /// All sets, one after the other, each direction around z with a zero behind it; for shaders.
+    /// All sets, one after the other, directions around z; for shaders. Behind direction i of a
+    /// set stands the place in the set of the one that is i-th in the sorted order.
     #[cfg(feature = "gpu")]
     pub(crate) fn table(&self) -> Vec<[f32; 4]> {
         let mut table = vec![[0.0; 4]; SETS * self.rays];
         for (set, out) in self.sets.iter().zip(table.chunks_mut(self.rays)) {
             for index in 0..self.rays {
-                out[set.given(index)] = set.direction(index).extend(0.0).into();
+                let [x, y, z] = set.direction(index).to_array();
+                out[set.given(index)][..3].copy_from_slice(&[x, y, z]);
+                out[index][3] = set.given(index) as f32;
             }
         }
         table

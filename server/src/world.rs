@@ -11,7 +11,7 @@ use crate::points::{
     PointError, SurfacePoint, generate, generate_adaptive, largest_radius, morton_order,
 };
 use crate::rays::{
-    Against, CpuTracer, Deformed, Fan, TooManyTriangles, Tracer, offset_origin, reach,
+    Against, CpuTracer, Deformed, Fan, FanTracer, TooManyTriangles, Tracer, offset_origin, reach,
 };
 use crate::samples::Samples;
 use crate::scene::{InstancePose, Mesh, Pose, Scene};
@@ -216,6 +216,8 @@ pub struct World {
     /// Largest local coordinates of each mesh.
     extents: Vec<Vec3>,
     tracer: CpuTracer,
+    /// What traces rays against what stands still in the processor's place.
+    still: Option<Box<dyn FanTracer>>,
     samples: Samples,
     carriers: Vec<Option<Carrier>>,
     points: Vec<SurfacePoint>,
@@ -294,6 +296,7 @@ impl World {
             extents: scene.meshes.iter().map(extent).collect(),
             loose_cells: 1,
             tracer,
+            still: None,
             carriers: vec![None; scene.instances.len()],
             points: Vec::new(),
             places: Vec::new(),
@@ -524,6 +527,28 @@ impl World {
         }
     }
 
+    /// Which instances move, or may: the others stand still.
+    pub fn moves(&self) -> &[bool] {
+        &self.moves
+    }
+
+    /// From now on another device traces the rays that points on what stands still gain against
+    /// what stands still; all others stay with the processor. If the device fails, the processor
+    /// takes over, and a warning says so.
+    pub fn trace_still_on(&mut self, device: Box<dyn FanTracer>) {
+        self.still = Some(device);
+    }
+
+    /// Whether another device than the processor traces what [`World::trace_still_on`] says.
+    pub fn has_device(&self) -> bool {
+        self.still.is_some()
+    }
+
+    fn give_up_device(&mut self, why: &str) {
+        tracing::warn!("{why}: the processor traces all rays from now on");
+        self.still = None;
+    }
+
     /// The engine (or a client) moves an instance from now on; world metres.
     ///
     /// # Errors
@@ -588,6 +613,11 @@ impl World {
         // It has no more triangles than before, so the tracer that fitted still fits.
         if let Ok(tracer) = CpuTracer::new(&self.scene, &self.pose, &self.deformed, &self.moves) {
             self.tracer = tracer;
+        }
+        if let Some(device) = &mut self.still
+            && let Err(why) = device.divide(&self.scene, &self.pose, &self.moves)
+        {
+            self.give_up_device(&why);
         }
         let (reach, words) = (self.options.ao_distance_m, self.words());
         for slice in &mut self.slices {
@@ -1016,9 +1046,15 @@ impl World {
                 rays: due.rays,
                 blocks,
                 block_rays: [0; BATCH_POINTS / BLOCK],
+                still: None,
                 fixed: own,
                 occlusion: own_occlusion,
             });
+        }
+        if let Some(device) = &self.still
+            && let Err(why) = self.trace_still(&**device, &mut batches)
+        {
+            self.give_up_device(&why);
         }
         let done = std::sync::atomic::AtomicU64::new(0);
         let counts = batches
@@ -1086,6 +1122,77 @@ impl World {
         changed
     }
 
+    /// Traces on `device` the rays that points on what stands still gain against what stands
+    /// still. Batches that it did not get to are left to the processor.
+    fn trace_still(&self, device: &dyn FanTracer, batches: &mut [Batch<'_>]) -> Result<(), String> {
+        let words = self.words();
+        let slice = |batch: &Batch<'_>| &self.slices[batch.slice];
+        let gains = |batch: &&mut Batch<'_>| {
+            batch.rays > slice(batch).rays_done && !self.moves[slice(batch).instance as usize]
+        };
+        let mut gaining: Vec<&mut Batch<'_>> = batches.iter_mut().filter(gains).collect();
+        for batches in gaining.chunks_mut(DEVICE_BATCHES) {
+            let fans = batches.par_iter().flat_map_iter(|batch| {
+                let surface = self.surface(slice(batch).instance);
+                let fan = move |number: u32| {
+                    let point = &self.points[number as usize];
+                    self.fan(
+                        &surface,
+                        number,
+                        surface.position(point),
+                        surface.normal(point),
+                    )
+                };
+                batch.points.clone().map(fan)
+            });
+            let fans: Vec<Fan<'_>> = fans.collect();
+            let mut todo = vec![0; fans.len() * words];
+            let mut hit = todo.clone();
+            let (mut left, mut asked) = (&fans[..], todo.chunks_exact_mut(words));
+            for batch in &mut *batches {
+                let (own, rest) = left.split_at(batch.points.len());
+                left = rest;
+                for (fan, todo) in own.iter().zip(&mut asked) {
+                    fan.directions
+                        .mark_given(slice(batch).rays_done..batch.rays, todo);
+                }
+            }
+            device.occluded_fans(&fans, self.options.ao_distance_m, &todo, &mut hit)?;
+            let (mut todo, mut hit) = (&todo[..], &hit[..]);
+            for batch in &mut *batches {
+                let of_batch = batch.fixed.len();
+                batch.still = Some(open(&todo[..of_batch], batch.fixed));
+                for (fixed, hit) in batch.fixed.iter_mut().zip(hit) {
+                    *fixed |= hit;
+                }
+                (todo, hit) = (&todo[of_batch..], &hit[of_batch..]);
+            }
+        }
+        Ok(())
+    }
+
+    /// An instance as its points lie on it in the present pose.
+    fn surface(&self, instance: u32) -> Surface<'_> {
+        let (positions, normals) = self.vertices(instance);
+        Surface {
+            triangles: &self.mesh(instance).triangles,
+            positions,
+            normals,
+            pose: &self.pose.instances[instance as usize],
+            reach: self.reach(instance),
+        }
+    }
+
+    /// A point's rays from where it is in the world.
+    fn fan(&self, on: &Surface<'_>, number: u32, position: Vec3, normal: Vec3) -> Fan<'_> {
+        let point = &self.points[number as usize];
+        let outward = point.geometric_normal(on.triangles, on.positions);
+        let origin = offset_origin(position, on.pose.world_normal(outward), on.reach);
+        let tangent = point.tangent(on.triangles, on.positions);
+        let tangent = on.pose.world_from_local.transform_vector3(tangent);
+        self.samples.fan(number, origin, normal, tangent)
+    }
+
     /// Traces some points of a slice; rays and points that were traced.
     fn trace_batch(&self, batch: &mut Batch<'_>) -> (u64, u64) {
         let slice = &self.slices[batch.slice];
@@ -1099,10 +1206,7 @@ impl World {
             ),
             (false, false) => (Some(Against::Static), Against::Movers),
         };
-        let triangles = &self.mesh(instance).triangles;
-        let (positions, normals) = self.vertices(instance);
-        let pose = &self.pose.instances[instance as usize];
-        let reach = self.reach(instance);
+        let surface = self.surface(instance);
         let t_max = self.options.ao_distance_m;
         let (rays, words) = (batch.rays, self.words());
         let converging = rays > slice.rays_done;
@@ -1113,7 +1217,7 @@ impl World {
             .filter(near)
             .collect();
         let (mut todo, mut hit, mut known) = (vec![0; words], vec![0; words], vec![0; words]);
-        let (mut rays_traced, mut points_traced) = (0, 0);
+        let (mut rays_traced, mut points_traced) = (batch.still.unwrap_or(0), 0);
         let parts = batch
             .fixed
             .chunks_exact_mut(words)
@@ -1124,31 +1228,26 @@ impl World {
                 continue;
             }
             let point = &self.points[number as usize];
-            let local = point.position(triangles, positions);
-            let position = pose.world_from_local.transform_point3(local);
+            let position = surface.position(point);
             let only_movers = others == Against::Movers;
             let in_reach = |mover: &&Hull| mover.is_within(position, t_max);
             if only_movers && !converging && !movers.iter().any(|m| in_reach(&m)) {
                 *occlusion = openness(fixed, rays);
                 continue;
             }
-            let normal = pose.world_normal(point.normal(triangles, positions, normals));
+            let normal = surface.normal(point);
             let ahead = |mover: &&Hull| in_reach(mover) && mover.is_ahead(position, normal);
             let others_near = !only_movers || movers.iter().any(|m| ahead(&m));
             if !converging && !others_near {
                 *occlusion = openness(fixed, rays);
                 continue;
             }
-            let outward = pose.world_normal(point.geometric_normal(triangles, positions));
-            let origin = offset_origin(position, outward, reach);
-            let tangent = point.tangent(triangles, positions);
-            let tangent = pose.world_from_local.transform_vector3(tangent);
-            let fan = self.samples.fan(number, origin, normal, tangent);
+            let fan = self.fan(&surface, number, position, normal);
             points_traced += 1;
             let before = rays_traced;
             hit.fill(0);
             if let Some(attached) = attached {
-                if converging {
+                if converging && batch.still.is_none() {
                     fan.directions.mark_given(slice.rays_done..rays, &mut todo);
                     rays_traced += open(&todo, fixed);
                     self.tracer
@@ -1614,6 +1713,9 @@ impl std::error::Error for NoInstance {}
 /// Points of a slice that are traced together: few, so that all threads end together.
 const BATCH_POINTS: usize = 128;
 
+/// Batches that a device gets at once: many rays, of little memory.
+const DEVICE_BATCHES: usize = 512;
+
 /// An eye within this of a slice sees no more of it, metres.
 const NEAREST_M: f32 = 0.5;
 
@@ -1706,10 +1808,36 @@ struct Batch<'a> {
     blocks: u8,
     /// Rays that each took.
     block_rays: [u32; BATCH_POINTS / BLOCK],
+    /// Rays against what stands still, if they have been traced already.
+    still: Option<u64>,
     /// Their part of [`World::fixed`].
     fixed: &'a mut [u64],
     /// What they say.
     occlusion: &'a mut [u8],
+}
+
+/// What a point's rays need of its instance.
+struct Surface<'a> {
+    triangles: &'a [[u32; 3]],
+    /// Of vertices, in local space.
+    positions: &'a [Vec3],
+    normals: &'a [Vec3],
+    pose: &'a InstancePose,
+    reach: f32,
+}
+
+impl Surface<'_> {
+    /// Where a point is in the world.
+    fn position(&self, point: &SurfacePoint) -> Vec3 {
+        let local = point.position(self.triangles, self.positions);
+        self.pose.world_from_local.transform_point3(local)
+    }
+
+    /// Its unit normal in the world.
+    fn normal(&self, point: &SurfacePoint) -> Vec3 {
+        let local = point.normal(self.triangles, self.positions, self.normals);
+        self.pose.world_normal(local)
+    }
 }
 
 /// Bounds of an instance's vertices in local space.

@@ -8,9 +8,9 @@ use psao_server::camera::Camera;
 use psao_server::gpu::Gpu;
 use psao_server::gpu::gbuffer::{GBuffer, Renderer};
 use psao_server::gpu::screen::{self, HIGH, LOW, Quality, Source};
-use psao_server::gpu::trace::{GpuTracer, Ray};
+use psao_server::gpu::trace::{GpuTracer, Ray, StillTracer};
 use psao_server::metrics::Pair;
-use psao_server::rays::Against;
+use psao_server::rays::{Against, Fan, FanTracer, offset_origin};
 use psao_server::render::{REFERENCE_RAYS, View};
 use psao_server::samples::Samples;
 use psao_server::scene::{Instance, LocalTransform, Mask, Mesh, Node, Scene, Wrap};
@@ -173,6 +173,146 @@ fn each_ray_hits_on_the_gpu_what_it_hits_on_the_processor() {
             differ * 20_000 <= rays.len(),
             "{differ} of {} rays differ",
             rays.len()
+        );
+    }
+}
+
+/// A ray that the processor answers one way or the other when it is moved by a few roundings.
+fn is_on_edge(world: &World, fan: &Fan<'_>, index: usize, t_max: f32) -> bool {
+    let direction = fan.direction(index);
+    let (a, b) = direction.any_orthonormal_pair();
+    let size = fan.origin.abs().max_element().max(1.0);
+    let mut answers = std::collections::BTreeSet::new();
+    for turn in 0..24 {
+        let (sin, cos) = (turn as f32).sin_cos();
+        let aside = (a * cos + b * sin) * (1 + turn % 3) as f32;
+        let longer = 1.0 + (turn % 5 - 2) as f32 * 2e-6;
+        let origin = fan.origin + aside * size * 1e-6;
+        let directions = [(direction + aside * 1e-6).normalize()];
+        let mut hit = [0];
+        let (tracer, group) = (world.tracer(), Against::Static);
+        tracer.occluded(group, origin, &directions, t_max * longer, &[1], &mut hit);
+        answers.insert(hit[0]);
+    }
+    answers.len() == 2
+}
+
+#[test]
+fn each_ray_of_a_fan_hits_on_the_gpu_what_it_hits_on_the_processor_unless_it_grazes() {
+    let world = atrium(0.0);
+    let samples = Samples::new(200);
+    let device = StillTracer::open(&world.scene, &world.pose, 200, world.moves());
+    let device = device.expect("a Vulkan driver: apt-get install mesa-vulkan-drivers");
+    let mut fans = Vec::new();
+    for slice in &world.slices {
+        let reach = world.reach(slice.instance);
+        for number in slice.points.clone().step_by(2) {
+            let [position, normal] = world.point_in_world(slice.instance, number);
+            let origin = offset_origin(position, normal, reach);
+            fans.push(samples.fan(number, origin, normal, glam::Vec3::X));
+        }
+    }
+    // One that starts nowhere hits nothing, and does no harm to others.
+    fans[7].origin = glam::Vec3::NAN;
+    let words = fans[0].directions.words();
+    let mut todo = vec![0; fans.len() * words];
+    // The first of each set, but for some that are known to hit.
+    let (mut found, mut expected) = (todo.clone(), todo.clone());
+    for ((fan, todo), found) in fans
+        .iter()
+        .zip(todo.chunks_mut(words))
+        .zip(found.chunks_mut(words))
+    {
+        fan.directions.mark_given(0..128, todo);
+        found[1] = 0b1011;
+    }
+    expected.copy_from_slice(&found);
+    let t_max = 2.0;
+    device
+        .occluded_fans(&fans, t_max, &todo, &mut found)
+        .expect("a device");
+    let bits = todo.chunks(words).zip(expected.chunks_mut(words));
+    for (fan, (todo, hit)) in fans.iter().zip(bits) {
+        let tracer = world.tracer();
+        tracer.occluded_fan(Against::Static, fan, t_max, todo, hit);
+    }
+    let blocked: u32 = expected.iter().map(|word| word.count_ones()).sum();
+    let rays = fans.len() * 128;
+    let mut differ = 0;
+    for (word, (found, expected)) in found.iter().zip(&expected).enumerate() {
+        let differing = (0..64).filter(|bit| (found ^ expected) >> bit & 1 == 1);
+        for bit in differing {
+            let (fan, index) = (&fans[word / words], word % words * 64 + bit);
+            differ += 1;
+            assert!(
+                is_on_edge(&world, fan, index, t_max),
+                "fan {}, ray {index}: {found:x}, {expected:x}",
+                word / words
+            );
+        }
+    }
+    println!("of {rays} rays {blocked} hit, {differ} differ");
+    assert!(
+        blocked as usize * 5 > rays && (blocked as usize) < rays / 20 * 19,
+        "not much of a test"
+    );
+    assert!(differ * 20_000 <= rays, "{differ} of {rays} rays differ");
+}
+
+/// The built-in scene, all of it converged, before and after things have moved, one of them that
+/// stood still; on the GPU what stands still.
+fn occlusion(on_gpu: bool) -> [Vec<u8>; 2] {
+    let options = Options {
+        density: 12.0,
+        rays: 128,
+        rest_space: true,
+        ..Options::of(psao_core::Kernel::Planar)
+    };
+    let mut world =
+        World::new(Scene::atrium(), options, &|_, _, _| ()).expect("the built-in scene");
+    if on_gpu {
+        let device = StillTracer::open(&world.scene, &world.pose, 128, world.moves());
+        let device = device.expect("a Vulkan driver: apt-get install mesa-vulkan-drivers");
+        world.trace_still_on(Box::new(device));
+    }
+    let said = |world: &World| {
+        let points = 0..world.point_count() as u32;
+        points.map(|point| world.occlusion_of(point)).collect()
+    };
+    world.converge(&|_| true, usize::MAX, &|_, _| ());
+    let before = said(&world);
+    let still = world.moves().iter().position(|moves| !moves);
+    let still = still.expect("an instance that stands still") as u32;
+    let place = world.pose.instances[still as usize].world_from_local;
+    let mut moved = glam::DAffine3::from_mat3_translation(
+        place.matrix3.as_dmat3(),
+        place.translation.as_dvec3() + world.scene.origin,
+    );
+    moved.translation.y += 0.1;
+    world.drive(still, moved).expect("it is there");
+    world.step(1.5, &|_| true, 0);
+    world.converge(&|_| true, usize::MAX, &|_, _| ());
+    assert_eq!(world.has_device(), on_gpu);
+    [before, said(&world)]
+}
+
+#[test]
+fn all_points_say_the_same_whether_the_gpu_or_the_processor_traces_what_stands_still() {
+    for (on_gpu, on_cpu) in occlusion(true).iter().zip(&occlusion(false)) {
+        let off = on_gpu.iter().zip(on_cpu).map(|(a, b)| a.abs_diff(*b));
+        let differ = off.clone().filter(|off| *off > 0).count();
+        let most = off.max().unwrap_or(0);
+        let dark = on_cpu.iter().filter(|said| **said < 200).count();
+        println!(
+            "of {} points ({dark} dark) {differ} say something else, {most}/255 at most",
+            on_cpu.len()
+        );
+        assert!(dark * 20 > on_cpu.len(), "not much of a test");
+        // A ray that grazes an edge: 2/255 of a point of 128 rays.
+        assert!(
+            differ * 200 <= on_cpu.len() && most <= 2,
+            "{differ} of {} points, by up to {most}/255",
+            on_cpu.len()
         );
     }
 }

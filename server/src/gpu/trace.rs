@@ -1,11 +1,12 @@
 //! Occlusion by rays on the GPU: rays in, hits out, and rays a pixel over a G-buffer.
 //!
-//! What a frame of the server asks for is a few thousand points at a time, group by group, and its
-//! answers steer what is asked next: that stays on the processor. This is for many rays at once.
+//! What moves is asked of a few thousand points at a time, group by group, and its answers steer
+//! what is asked next: that stays on the processor. This is for many rays at once, as when points
+//! near what stands still converge.
 
 use super::gbuffer::{GBuffer, Masks, Renderer};
 use super::{Gpu, Pass};
-use crate::rays::{is_placed, wide_tree};
+use crate::rays::{Fan, FanTracer, is_placed, wide_tree};
 use crate::samples::Samples;
 use crate::scene::{Pose, Scene};
 use bytemuck::{Pod, Zeroable};
@@ -32,6 +33,18 @@ const STACK: usize = 32;
 /// Rays of one call of the shader, so that none takes longer than a driver waits.
 const RAYS_A_CALL: usize = 1 << 19;
 
+/// The same of fans, whose rays are short.
+const FAN_RAYS_A_CALL: usize = 1 << 21;
+
+/// As `Fan` in the shader.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+struct FanRow {
+    origin: Vec3,
+    set: u32,
+    axes: [[f32; 4]; 3],
+}
+
 /// As `Trees` in the shader.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
@@ -42,7 +55,8 @@ struct Trees {
     rays: u32,
     first: u32,
     t_max: f32,
-    unused: [u32; 2],
+    fan_words: u32,
+    unused: u32,
 }
 
 /// Triangles under a tree, as the shader reads them.
@@ -66,10 +80,11 @@ pub struct GpuTracer {
     fixed_uvs: usize,
     occluded: wgpu::ComputePipeline,
     pixels: wgpu::ComputePipeline,
+    fans: wgpu::ComputePipeline,
 }
 
 impl GpuTracer {
-    /// Builds the trees. `samples` holds the directions that pixels take.
+    /// Builds the trees. `samples` holds the directions that pixels and fans take.
     ///
     /// # Errors
     /// The device has no room for the scene, or its triangles are so nested that the tree is too
@@ -80,11 +95,17 @@ impl GpuTracer {
         pose: &Pose,
         samples: &Samples,
     ) -> Result<GpuTracer, String> {
-        let moves: Vec<bool> = scene
-            .instances
-            .iter()
-            .map(|i| i.moves || i.deforms)
-            .collect();
+        let moves = scene.instances.iter().map(|i| i.moves || i.deforms);
+        GpuTracer::of(gpu, scene, pose, samples, moves.collect())
+    }
+
+    fn of(
+        gpu: &Gpu,
+        scene: &Scene,
+        pose: &Pose,
+        samples: &Samples,
+        moves: Vec<bool>,
+    ) -> Result<GpuTracer, String> {
         let masks = Masks::new(gpu, scene)?;
         let fixed = Body::new(scene, pose, &masks, 0, |i| !moves[i])?;
         let moving = Body::new(scene, pose, &masks, fixed.uvs.len(), |i| moves[i])?;
@@ -117,6 +138,7 @@ impl GpuTracer {
             fixed_uvs,
             occluded: gpu.compute(&shader, "occluded"),
             pixels: gpu.compute(&shader, "pixels"),
+            fans: gpu.compute(&shader, "fans"),
         };
         tracer.write_moving_nodes(gpu, &moving.tree);
         Ok(tracer)
@@ -193,6 +215,76 @@ impl GpuTracer {
         Ok(all)
     }
 
+    /// Which rays of fans anything that stands still is in the way of: as
+    /// [`FanTracer::occluded_fans`].
+    fn occluded_fans(
+        &self,
+        gpu: &Gpu,
+        fans: &[Fan<'_>],
+        t_max: f32,
+        todo: &[u64],
+        hit: &mut [u64],
+    ) -> Result<(), String> {
+        let words = fans.first().map_or(1, |fan| fan.directions.words().max(1));
+        let fans_a_call = (FAN_RAYS_A_CALL / 64 / words).max(1);
+        let bits = todo.chunks(fans_a_call * words);
+        let bits = bits.zip(hit.chunks_mut(fans_a_call * words));
+        for (fans, (todo, hit)) in fans.chunks(fans_a_call).zip(bits) {
+            let row = |fan: &Fan<'_>| FanRow {
+                origin: fan.origin,
+                set: fan.directions.set,
+                axes: fan.axes.to_cols_array_2d().map(|[x, y, z]| [x, y, z, 0.0]),
+            };
+            let rows: Vec<FanRow> = fans.iter().map(row).collect();
+            // A fan from nowhere hits nothing, and must not get lost in the trees.
+            let asked = todo
+                .iter()
+                .zip(&*hit)
+                .enumerate()
+                .flat_map(|(i, (todo, hit))| {
+                    let open = if fans[i / words].origin.is_finite() {
+                        todo & !hit
+                    } else {
+                        0
+                    };
+                    [open as u32, (open >> 32) as u32]
+                });
+            let asked: Vec<u32> = asked.collect();
+            let trees = Trees {
+                rays: asked.len() as u32,
+                // Finite, which is far enough.
+                t_max: t_max.min(1e30),
+                fan_words: words as u32 * 2,
+                ..self.trees
+            };
+            gpu.write(&self.uniform, bytemuck::bytes_of(&trees));
+            let rows = gpu.storage("fans", &rows)?;
+            let bits = gpu.filled("bits of rays", &asked, HITS)?;
+            let asked_of = [
+                (5, self.directions.as_entire_binding()),
+                (7, rows.as_entire_binding()),
+                (8, bits.as_entire_binding()),
+            ];
+            let workgroups = [asked.len().div_ceil(64) as u32, 1];
+            let pipeline = self.fans.clone();
+            let pass = Pass::new(
+                gpu,
+                "fans",
+                pipeline,
+                &[&self.scene(), &asked_of],
+                workgroups,
+            );
+            let mut encoder = gpu.encoder();
+            pass.record(&mut encoder);
+            gpu.queue.submit([encoder.finish()]);
+            let found: Vec<u32> = gpu.read(&bits)?;
+            for (hit, found) in hit.iter_mut().zip(found.chunks_exact(2)) {
+                *hit |= u64::from(found[0]) | u64::from(found[1]) << 32;
+            }
+        }
+        Ok(())
+    }
+
     /// A pass that traces rays of every pixel's set, `rays` of them from the `first` on, and puts
     /// the open share into an R32Float texture of the G-buffer's size; with `first` above 0, what
     /// an earlier pass put there counts for as many rays.
@@ -229,6 +321,53 @@ impl GpuTracer {
         ];
         let tiles = buffer.size.map(|edge| edge.div_ceil(8));
         Pass::new(gpu, "rays", self.pixels.clone(), &[&scene, &pixels], tiles)
+    }
+}
+
+/// Traces points' rays against what stands still, on the fastest device there is.
+pub struct StillTracer {
+    gpu: Gpu,
+    samples: Samples,
+    tracer: GpuTracer,
+}
+
+impl StillTracer {
+    /// Opens the device and builds the trees. `rays`: of a point, as in
+    /// [`Options::rays`](crate::world::Options::rays); `moves`: as [`FanTracer::divide`] takes it.
+    ///
+    /// # Errors
+    /// There is no device, or as [`GpuTracer::new`].
+    pub fn open(
+        scene: &Scene,
+        pose: &Pose,
+        rays: usize,
+        moves: &[bool],
+    ) -> Result<StillTracer, String> {
+        let gpu = Gpu::open()?;
+        let samples = Samples::new(rays);
+        let tracer = GpuTracer::of(&gpu, scene, pose, &samples, moves.to_vec())?;
+        Ok(StillTracer {
+            gpu,
+            samples,
+            tracer,
+        })
+    }
+}
+
+impl FanTracer for StillTracer {
+    fn occluded_fans(
+        &self,
+        fans: &[Fan<'_>],
+        t_max: f32,
+        todo: &[u64],
+        hit: &mut [u64],
+    ) -> Result<(), String> {
+        self.tracer.occluded_fans(&self.gpu, fans, t_max, todo, hit)
+    }
+
+    fn divide(&mut self, scene: &Scene, pose: &Pose, moves: &[bool]) -> Result<(), String> {
+        self.tracer = GpuTracer::of(&self.gpu, scene, pose, &self.samples, moves.to_vec())?;
+        Ok(())
     }
 }
 

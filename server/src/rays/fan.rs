@@ -29,6 +29,8 @@ pub struct Directions {
     given: Vec<u16>,
     /// All have z >= 0.
     upward: bool,
+    /// Which of several sets this is, for a device that has them all.
+    pub set: u32,
 }
 
 /// Up to [`BUNDLE`] directions; those missing have no length, so that they hit nothing.
@@ -54,6 +56,7 @@ impl Directions {
             bundles: bundles.collect(),
             upward: directions.iter().all(|d| d.z >= 0.0),
             given,
+            set: 0,
         }
     }
 

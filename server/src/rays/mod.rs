@@ -112,6 +112,34 @@ pub trait Tracer: Send + Sync {
     fn update(&mut self, scene: &Scene, pose: &Pose, deformed: &[Deformed]);
 }
 
+/// Answers for many points at once what stands still near them: another device than the processor,
+/// which is worth asking only for many rays together.
+pub trait FanTracer: Send + Sync {
+    /// As [`Tracer::occluded_fan`] of [`Against::Static`] for each of `fans`, which take sets of
+    /// the samples that this was made with. Bits are fan after fan, as many words each as its
+    /// directions have.
+    ///
+    /// But for rays that graze an edge, or end on a surface, to within the rounding of 32-bit
+    /// floats, the same rays hit.
+    ///
+    /// # Errors
+    /// The device has no room, or is lost; `hit` is as it was, or has some of its bits.
+    fn occluded_fans(
+        &self,
+        fans: &[Fan<'_>],
+        t_max: f32,
+        todo: &[u64],
+        hit: &mut [u64],
+    ) -> Result<(), String>;
+
+    /// Another division of the same scene: only instances that `moves` does not name stand still,
+    /// as `pose` has them.
+    ///
+    /// # Errors
+    /// The device has no room, or is lost.
+    fn divide(&mut self, scene: &Scene, pose: &Pose, moves: &[bool]) -> Result<(), String>;
+}
+
 /// More static triangles than [`MAX_STATIC_TRIANGLES`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct TooManyTriangles {
