@@ -60,6 +60,12 @@ const ROUNDS: usize = 15;
 /// Passes of the denoiser behind rays: as after the better screen-space method.
 const DENOISE_RAYS: u32 = HIGH.denoise;
 
+/// The method that not every device has.
+const RAY_QUERY: &str = "1 ray a pixel, ray query";
+
+/// Most pixels that it may answer otherwise: a ray along an edge may round to either side of it.
+const QUERY_OFF_SHARE: f64 = 1e-3;
+
 /// Frames of which pictures are kept.
 const PICTURES: u32 = 4;
 
@@ -120,6 +126,10 @@ pub struct Race {
     pub fast_off_share: f64,
     /// Largest difference of the two, 1/255.
     pub fast_off_255: f64,
+    /// Why no row is by the device's own ray queries, if none is.
+    pub no_ray_query: Option<&'static str>,
+    /// Share of the pixels whose ray the device's own query answers otherwise; 0 without.
+    pub query_off_share: f64,
     /// One a method.
     pub rows: Vec<Row>,
 }
@@ -175,13 +185,17 @@ impl Work<'_> {
     }
 }
 
-/// Runs the race.
+/// Runs the race; ray queries take part where `experimental` allows them and the device has them.
 ///
 /// # Errors
-/// What went wrong, and what to do about it: no GPU, none with timestamps, or a lookup that is not
-/// what it has to be.
-pub fn run(args: &BenchGpuArgs, progress: Progress<'_>) -> Result<Race, String> {
-    let gpu = Gpu::open()?;
+/// What went wrong, and what to do about it: no GPU, none with timestamps, or a lookup or rays that
+/// are not what they have to be.
+pub fn run(
+    args: &BenchGpuArgs,
+    experimental: wgpu::ExperimentalFeatures,
+    progress: Progress<'_>,
+) -> Result<Race, String> {
+    let gpu = Gpu::open_with(experimental)?;
     let mut watch = Stopwatch::new(&gpu)?;
     let mut world = args.scene.world(true, progress)?;
     let size = [args.size.0 as u32, args.size.1 as u32];
@@ -219,10 +233,12 @@ pub fn run(args: &BenchGpuArgs, progress: Progress<'_>) -> Result<Race, String> 
         exact_off_255: 0.0,
         fast_off_share: 0.0,
         fast_off_255: 0.0,
+        no_ray_query: gpu.no_ray_query,
+        query_off_share: 0.0,
         rows: Vec::new(),
     };
     let mut methods: Vec<Method> = Vec::new();
-    let (mut pixels, mut off) = (0.0, 0.0);
+    let (mut pixels, mut off, mut query_off) = (0.0, 0.0, 0.0);
     let mut references = Vec::new();
     for frame in 0..args.frames {
         let camera = path.at(time_of(frame));
@@ -241,8 +257,8 @@ pub fn run(args: &BenchGpuArgs, progress: Progress<'_>) -> Result<Race, String> 
         renderer.draw(&gpu, &world.scene, &camera, &mut encoder, &mut buffer);
         gpu.finish(encoder)?;
         let view = buffer.view(&gpu)?;
+        let reach = world.options.ao_distance_m;
         let traced = |first, rays_a_pixel, into: &_| {
-            let reach = world.options.ao_distance_m;
             tracer.pixels(&gpu, &buffer, &renderer, into, reach, [first, rays_a_pixel])
         };
 
@@ -277,7 +293,7 @@ pub fn run(args: &BenchGpuArgs, progress: Progress<'_>) -> Result<Race, String> 
         let mut denoised = vec![traced(0, 1, &rays)];
         let source = Source::Picture(&rays, DENOISE_RAYS);
         denoised.extend(screen::passes(&gpu, &buffer, source, &openness)?);
-        let works = [
+        let mut works = vec![
             ("lookup, fast", lookup(1)),
             ("lookup, exact", lookup(0)),
             ("screen space, low", in_screen(LOW)?),
@@ -285,12 +301,15 @@ pub fn run(args: &BenchGpuArgs, progress: Progress<'_>) -> Result<Race, String> 
             ("1 ray a pixel", Work::Passes(vec![traced(0, 1, &openness)])),
             ("1 ray a pixel, denoised", Work::Passes(denoised)),
         ];
+        let query = tracer.pixels_by_query(&gpu, &buffer, &renderer, &openness, reach, [0, 1]);
+        works.extend(query.map(|pass| (RAY_QUERY, Work::Passes(vec![pass]))));
 
         let valid = view.valid();
         let count = valid.iter().filter(|valid| **valid).count() as f64;
         pixels += count;
         let mut exact: Vec<f32> = Vec::new();
         let mut fast: Vec<f32> = Vec::new();
+        let mut by_trees: Vec<f32> = Vec::new();
         for (index, (name, work)) in works.iter().enumerate() {
             let mut encoder = gpu.encoder();
             work.record(&mut encoder, &buffers, |_| ());
@@ -316,6 +335,11 @@ pub fn run(args: &BenchGpuArgs, progress: Progress<'_>) -> Result<Race, String> 
             match index {
                 0 => fast = found,
                 1 => exact = found,
+                4 => by_trees = found,
+                6 => {
+                    let differ = found.iter().zip(&by_trees).filter(|(a, b)| a != b);
+                    query_off += differ.count() as f64;
+                }
                 _ => {}
             }
         }
@@ -330,6 +354,14 @@ pub fn run(args: &BenchGpuArgs, progress: Progress<'_>) -> Result<Race, String> 
         }
         off += over as f64;
         race.fast_off_share = off / pixels.max(1.0);
+        race.query_off_share = query_off / pixels.max(1.0);
+        if race.query_off_share > QUERY_OFF_SHARE {
+            return Err(format!(
+                "the device's own ray queries answer {:.4} of the rays otherwise than the trees: \
+                 please report it, with this device's name: {}",
+                race.query_off_share, race.adapter
+            ));
+        }
 
         for round in 0..ROUNDS {
             for turn in 0..works.len() {
@@ -469,6 +501,9 @@ impl Race {
                 ]);
             }
         }
+        if let Some(why) = self.no_ray_query {
+            out += &format!("| {RAY_QUERY:26} | {why}\n");
+        }
         out += &format!(
             "\nexact lookup off the processor's: at most {:.3}/255; fast off exact: at most \
              {:.3}/255, more than 1/255 in {:.4} % of the pixels\n",
@@ -476,6 +511,12 @@ impl Race {
             self.fast_off_255,
             self.fast_off_share * 100.0
         );
+        if self.no_ray_query.is_none() {
+            out += &format!(
+                "ray queries answer otherwise than the trees in {:.4} % of the pixels\n",
+                self.query_off_share * 100.0
+            );
+        }
         out
     }
 

@@ -579,7 +579,8 @@ fn the_race_checks_and_times_every_method_and_keeps_its_pictures() {
     let args = "psao --density 16 --rays 32 --size 96x54 --frames 2".split(' ');
     let mut args = Bench::parse_from(args).args;
     (args.out, args.json) = (Some(out.clone()), Some(json.clone()));
-    let race = bench_gpu::run(&args, &|_, _, _| ()).expect("a device with timestamps");
+    let experimental = wgpu::ExperimentalFeatures::disabled();
+    let race = bench_gpu::run(&args, experimental, &|_, _, _| ()).expect("a device that times");
     println!("{}", race.table());
     assert!(race.exact_off_255 <= 1.0 && race.fast_off_255 <= 4.0);
     assert_eq!(race.rows.len(), 6);
@@ -594,6 +595,11 @@ fn the_race_checks_and_times_every_method_and_keeps_its_pictures() {
             "{row:?}"
         );
     }
+    let why = race.no_ray_query.expect("nobody asked for ray queries");
+    assert!(
+        race.table()
+            .contains(&format!("| 1 ray a pixel, ray query   | {why}"))
+    );
     let of = |name: &str| {
         race.rows
             .iter()

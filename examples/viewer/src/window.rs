@@ -199,7 +199,11 @@ impl App<'_> {
         let instance = wgpu::Instance::new(wgpu::InstanceDescriptor::new_without_display_handle());
         let surface = instance.create_surface(Arc::clone(&window));
         let surface = surface.map_err(|error| format!("the window takes no pictures: {error}"))?;
-        let (gpu, adapter) = Gpu::of(&instance, Some(&surface))?;
+        let (gpu, adapter) = Gpu::of(
+            &instance,
+            Some(&surface),
+            wgpu::ExperimentalFeatures::disabled(),
+        )?;
         let size = window.inner_size();
         let mut config = surface
             .get_default_config(&adapter, size.width.max(1), size.height.max(1))

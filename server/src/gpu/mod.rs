@@ -5,6 +5,7 @@
 
 pub mod depth;
 pub mod gbuffer;
+mod query;
 pub mod screen;
 pub mod trace;
 
@@ -21,11 +22,15 @@ pub struct Gpu {
     pub queue: wgpu::Queue,
     /// What it is.
     pub info: wgpu::AdapterInfo,
+    /// Why rays can't be asked of the device itself, where they can't.
+    pub no_ray_query: Option<&'static str>,
 }
 
 /// What is asked of timestamps: between passes, wherever a caller wants them.
 const TIMESTAMPS: wgpu::Features =
     wgpu::Features::TIMESTAMP_QUERY.union(wgpu::Features::TIMESTAMP_QUERY_INSIDE_ENCODERS);
+
+const RAY_QUERY: wgpu::Features = wgpu::Features::EXPERIMENTAL_RAY_QUERY;
 
 impl Gpu {
     /// The fastest device there is, for work without a window.
@@ -33,17 +38,28 @@ impl Gpu {
     /// # Errors
     /// There is none, or it gives no access; says what to install.
     pub fn open() -> Result<Gpu, String> {
-        let instance = wgpu::Instance::new(wgpu::InstanceDescriptor::new_without_display_handle());
-        Ok(Gpu::of(&instance, None)?.0)
+        Gpu::open_with(wgpu::ExperimentalFeatures::disabled())
     }
 
-    /// The fastest device that can show pictures on a surface, if one is given, and its adapter.
+    /// As [`Gpu::open`], and with ray queries if the device has them and the caller accepts what
+    /// wgpu calls experimental.
+    ///
+    /// # Errors
+    /// As [`Gpu::open`].
+    pub fn open_with(experimental: wgpu::ExperimentalFeatures) -> Result<Gpu, String> {
+        let instance = wgpu::Instance::new(wgpu::InstanceDescriptor::new_without_display_handle());
+        Ok(Gpu::of(&instance, None, experimental)?.0)
+    }
+
+    /// The fastest device that can show pictures on a surface, if one is given, and its adapter;
+    /// `experimental` as in [`Gpu::open_with`].
     ///
     /// # Errors
     /// As [`Gpu::open`].
     pub fn of(
         instance: &wgpu::Instance,
         surface: Option<&wgpu::Surface<'_>>,
+        experimental: wgpu::ExperimentalFeatures,
     ) -> Result<(Gpu, wgpu::Adapter), String> {
         let options = wgpu::RequestAdapterOptions {
             power_preference: wgpu::PowerPreference::HighPerformance,
@@ -56,9 +72,19 @@ impl Gpu {
                  computes on the processor"
             )
         })?;
+        let no_ray_query = if !adapter.features().contains(RAY_QUERY) {
+            Some("not on this adapter")
+        } else if !experimental.is_enabled() {
+            Some("not asked for: experimental in wgpu")
+        } else {
+            None
+        };
+        let mut features = adapter.features() & TIMESTAMPS;
+        features.set(RAY_QUERY, no_ray_query.is_none());
         let wanted = wgpu::DeviceDescriptor {
             label: Some("psao"),
-            required_features: adapter.features() & TIMESTAMPS,
+            required_features: features,
+            experimental_features: experimental,
             // All that it has: scenes need large buffers.
             required_limits: adapter.limits(),
             ..Default::default()
@@ -69,6 +95,7 @@ impl Gpu {
             device,
             queue,
             info: adapter.get_info(),
+            no_ray_query,
         };
         Ok((gpu, adapter))
     }
@@ -145,7 +172,7 @@ impl Gpu {
     }
 
     fn shader(&self, what: &str, source: &str) -> wgpu::ShaderModule {
-        let source = Cow::Owned(format!("{}\n{source}", include_str!("eye.wgsl")));
+        let source = Cow::Owned(format!("{source}\n{}", include_str!("eye.wgsl")));
         self.device
             .create_shader_module(wgpu::ShaderModuleDescriptor {
                 label: Some(what),

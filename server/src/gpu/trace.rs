@@ -5,6 +5,7 @@
 //! near what stands still converge.
 
 use super::gbuffer::{GBuffer, Masks, Renderer};
+use super::query::{Bodies, Count};
 use super::{Gpu, Pass};
 use crate::rays::{Fan, FanTracer, is_placed, wide_tree};
 use crate::samples::Samples;
@@ -81,6 +82,8 @@ pub struct GpuTracer {
     occluded: wgpu::ComputePipeline,
     pixels: wgpu::ComputePipeline,
     fans: wgpu::ComputePipeline,
+    /// Where the device has ray queries.
+    bodies: Option<Bodies>,
 }
 
 impl GpuTracer {
@@ -119,7 +122,24 @@ impl GpuTracer {
         let mut uvs = fixed.uvs;
         let fixed_uvs = uvs.len();
         uvs.extend_from_slice(&moving.uvs);
-        let shader = gpu.shader("rays", include_str!("trace.wgsl"));
+        let source = concat!(include_str!("trees.wgsl"), "\n", include_str!("trace.wgsl"));
+        let shader = gpu.shader("rays", source);
+        let mut usage = wgpu::BufferUsages::STORAGE;
+        if gpu.no_ray_query.is_none() {
+            usage |= wgpu::BufferUsages::BLAS_INPUT;
+        }
+        let triangles_buffer = gpu.filled("traced triangles", &triangles, usage)?;
+        let bodies = gpu.no_ray_query.is_none().then(|| {
+            let count = |first, end, masked| Count {
+                triangles: first as u32..end as u32,
+                masked,
+            };
+            let counts = [
+                count(0, fixed_triangles, fixed_uvs > 0),
+                count(fixed_triangles, triangles.len(), uvs.len() > fixed_uvs),
+            ];
+            Bodies::new(gpu, &triangles_buffer, counts)
+        });
         let trees = Trees {
             fixed_nodes: fixed_nodes as u32,
             moving_nodes: moving.tree.nodes.len() as u32,
@@ -130,7 +150,7 @@ impl GpuTracer {
             trees,
             uniform: gpu.uniform("trees", &trees),
             nodes: gpu.storage("tree nodes", &nodes)?,
-            triangles: gpu.storage("traced triangles", &triangles)?,
+            triangles: triangles_buffer,
             uvs: gpu.storage("traced texture coordinates", &uvs)?,
             masks,
             directions: gpu.storage("directions", &samples.table())?,
@@ -139,6 +159,7 @@ impl GpuTracer {
             occluded: gpu.compute(&shader, "occluded"),
             pixels: gpu.compute(&shader, "pixels"),
             fans: gpu.compute(&shader, "fans"),
+            bodies,
         };
         tracer.write_moving_nodes(gpu, &moving.tree);
         Ok(tracer)
@@ -159,6 +180,9 @@ impl GpuTracer {
         let at = self.fixed_uvs as u64 * 24;
         gpu.queue
             .write_buffer(&self.uvs, at, bytemuck::cast_slice(&moving.uvs));
+        if let Some(bodies) = &self.bodies {
+            bodies.build(gpu, &self.triangles, 1..2);
+        }
         Ok(())
     }
 
@@ -169,11 +193,14 @@ impl GpuTracer {
             .write_buffer(&self.nodes, at, bytemuck::cast_slice(&words));
     }
 
-    /// What all kernels read.
-    fn scene(&self) -> [(u32, wgpu::BindingResource<'_>); 6] {
+    /// What all kernels read; `found_by` is what a ray finds its triangles by.
+    fn scene<'a>(
+        &'a self,
+        found_by: wgpu::BindingResource<'a>,
+    ) -> [(u32, wgpu::BindingResource<'a>); 6] {
         [
             (0, self.uniform.as_entire_binding()),
-            (1, self.nodes.as_entire_binding()),
+            (1, found_by),
             (2, self.triangles.as_entire_binding()),
             (3, self.uvs.as_entire_binding()),
             (4, self.masks.info.as_entire_binding()),
@@ -197,7 +224,7 @@ impl GpuTracer {
             let words = part.len().div_ceil(32);
             let hits = gpu.filled("hits", &vec![0u32; words], HITS)?;
             let asked = gpu.storage("rays", part)?;
-            let mut resources = self.scene().to_vec();
+            let mut resources = self.scene(self.nodes.as_entire_binding()).to_vec();
             resources.push((6, asked.as_entire_binding()));
             resources.push((7, hits.as_entire_binding()));
             let bound = gpu.bind(&self.occluded.get_bind_group_layout(0), &resources);
@@ -295,6 +322,35 @@ impl GpuTracer {
         renderer: &Renderer,
         openness: &wgpu::Texture,
         t_max_m: f32,
+        rays: [u32; 2],
+    ) -> Pass {
+        let by_trees = (&self.pixels, self.nodes.as_entire_binding());
+        self.pixels_by(by_trees, gpu, buffer, renderer, openness, t_max_m, rays)
+    }
+
+    /// As [`GpuTracer::pixels`], by the device's own ray queries; `None` where it has none.
+    pub fn pixels_by_query(
+        &self,
+        gpu: &Gpu,
+        buffer: &GBuffer,
+        renderer: &Renderer,
+        openness: &wgpu::Texture,
+        t_max_m: f32,
+        rays: [u32; 2],
+    ) -> Option<Pass> {
+        let bodies = self.bodies.as_ref()?;
+        let by_query = (&bodies.pixels, bodies.scene.as_binding());
+        Some(self.pixels_by(by_query, gpu, buffer, renderer, openness, t_max_m, rays))
+    }
+
+    fn pixels_by(
+        &self,
+        (pipeline, found_by): (&wgpu::ComputePipeline, wgpu::BindingResource<'_>),
+        gpu: &Gpu,
+        buffer: &GBuffer,
+        renderer: &Renderer,
+        openness: &wgpu::Texture,
+        t_max_m: f32,
         [first, rays]: [u32; 2],
     ) -> Pass {
         let trees = Trees {
@@ -305,7 +361,7 @@ impl GpuTracer {
         };
         let view = |texture: &wgpu::Texture| texture.create_view(&Default::default());
         let uniform = gpu.uniform("trees", &trees);
-        let mut scene = self.scene().to_vec();
+        let mut scene = self.scene(found_by).to_vec();
         scene[0].1 = uniform.as_entire_binding();
         let textures = [&buffer.position, &buffer.world, &buffer.depth, openness].map(view);
         let [position, world, depth, openness] =
@@ -320,7 +376,7 @@ impl GpuTracer {
             (6, openness),
         ];
         let tiles = buffer.size.map(|edge| edge.div_ceil(8));
-        Pass::new(gpu, "rays", self.pixels.clone(), &[&scene, &pixels], tiles)
+        Pass::new(gpu, "rays", pipeline.clone(), &[&scene, &pixels], tiles)
     }
 }
 
