@@ -202,9 +202,9 @@ pub struct World {
     /// Where clients look from, metres from the scene's origin: points near what moves are only
     /// brought up to date when they may face one ([`World::facing`]). None: all are.
     pub eyes: Vec<Vec3>,
-    /// In rest space, of each instance the finest level of detail that a client has or is about to
-    /// get: when something moves near points of finer levels alone, they wait until a client is to
-    /// have them. Instances after the last, and level 0: none wait.
+    /// In rest space, of each instance the finest level of detail that a client has: points of
+    /// finer levels wait, when something moves near them, until a client has them. An instance
+    /// after the last, or of level 0, has all its points brought up to date.
     pub finest_levels: Vec<u32>,
     /// Instances' grids; and, unless [`Options::rest_space`], buckets and cells.
     pub truth: Truth,
