@@ -171,7 +171,7 @@ pub struct StreamArgs {
     #[arg(long, value_name = "MBIT", default_value_t = 0.0)]
     pub max_mbit: f64,
     /// Instances so far away that they have more points than this a pixel get fewer (profile
-    /// residual); 0 for all points always
+    /// residual), such as 0.01; at 1 only what fills next to no pixels. 0 for all points always
     #[arg(long, value_name = "N", default_value_t = 0.0)]
     pub points_per_pixel: f32,
     /// The extended field of view reaches this much farther on every side, degrees

@@ -245,6 +245,15 @@ impl Encoder {
         self.snapshot = true;
     }
 
+    /// Lowers each instance's level of detail to the finest that the client has, or may get at
+    /// once: from the levels of all clients, [`World::finest_levels`].
+    pub fn want_levels(&self, finest: &mut [u32]) {
+        match &self.sent {
+            Sent::Cells(_) => finest.fill(0),
+            Sent::Residual(sent) => sent.want_levels(finest),
+        }
+    }
+
     /// What the world changed in a step. To be called after every step, sent or not.
     pub fn merge(&mut self, world: &World) {
         match &mut self.sent {

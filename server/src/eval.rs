@@ -26,6 +26,7 @@ use psao_core::Cell;
 use psao_core::mirror::Buffer;
 use psao_core::residual::Quantiser;
 use psao_core::stream::{MAX_BODY_BYTES, PREAMBLE, Packet, kind};
+use psao_core::topology::LEVELS;
 use rayon::{ThreadPool, ThreadPoolBuilder};
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -81,6 +82,10 @@ pub struct EvalArgs {
         value_parser = parse_quantiser
     )]
     pub steps: Vec<Quantiser>,
+    /// Points a pixel that far instances are thinned to (profile residual), each measured by
+    /// itself; 0 for all points always. More rows of --size ask for more points
+    #[arg(long, value_name = "N,...", value_delimiter = ',', default_value = "0")]
+    pub points_per_pixel: Vec<f32>,
     /// Frames at each rate. The first second is reported apart; of less than two seconds, the
     /// first half where that is shorter
     #[arg(long, value_name = "N", default_value_t = 60,
@@ -159,6 +164,8 @@ pub struct Row {
     pub rate_hz: f64,
     /// What is not sent, and how coarse what is, in 1/255.
     pub quant: String,
+    /// Points a pixel that far instances are thinned to; 0 for all points.
+    pub points_per_pixel: f32,
     /// Megabits per second of scene time.
     pub mbit_per_s: f64,
     /// The part of it that is occlusion alone, in slices packets (profile `residual`).
@@ -210,6 +217,8 @@ pub struct Comparison {
     pub density: f64,
     /// Frames per second of scene time.
     pub rate_hz: f64,
+    /// Points a pixel of `residual`; 0 for all points.
+    pub points_per_pixel: f32,
     /// Point error of `cells`, 1/255.
     pub rmse_255: f64,
     /// Bits of `cells` over bits of `residual`, interpolated to that error; `null` where there is
@@ -260,6 +269,7 @@ pub fn run(args: &EvalArgs, progress: Progress<'_>) -> Result<Evaluation, String
         ("--rates", args.rates.len()),
         ("--densities", args.densities.len()),
         ("--steps", args.steps.len()),
+        ("--points-per-pixel", args.points_per_pixel.len()),
     ] {
         if count > MAX_VALUES {
             return Err(format!("{name} takes at most {MAX_VALUES} values"));
@@ -267,6 +277,10 @@ pub fn run(args: &EvalArgs, progress: Progress<'_>) -> Result<Evaluation, String
     }
     if !args.rates.iter().all(|rate| *rate > 0.0 && *rate <= 1000.0) {
         return Err("--rates must be above 0 and at most 1000".into());
+    }
+    let usable = |points: &f32| points.is_finite() && *points >= 0.0;
+    if !args.points_per_pixel.iter().all(usable) {
+        return Err("--points-per-pixel must be 0 (all points always) or more".into());
     }
     let pool = ThreadPoolBuilder::new().num_threads(1).build();
     let mut bench = Bench {
@@ -291,7 +305,9 @@ pub fn run(args: &EvalArgs, progress: Progress<'_>) -> Result<Evaluation, String
             bench.profile(profile, density, &mut found, progress)?;
         }
         for &rate_hz in &args.rates {
-            found.compare(density, rate_hz);
+            for &points_per_pixel in &args.points_per_pixel {
+                found.compare(density, rate_hz, points_per_pixel);
+            }
         }
     }
     if let Some(path) = &args.json {
@@ -331,14 +347,22 @@ impl Bench<'_> {
         };
         let placing = |name: &str, done, total| progress(&stage(name), done, total);
         let mut world = scene.world(profile == ProfileArg::Residual, &placing)?;
-        let schemes: Vec<Scheme> = match profile {
-            ProfileArg::Cells => vec![CELLS],
+        // Streams in a group are measured side by side: those that keep the same points.
+        let groups: Vec<Vec<Scheme>> = match profile {
+            ProfileArg::Cells => vec![vec![CELLS]],
             ProfileArg::Residual => {
-                let scheme = |&quantiser| Scheme::Residual(quantiser, Limits::default());
-                args.steps.iter().map(scheme).collect()
+                let group = |&points_per_pixel: &f32| {
+                    let limits = Limits {
+                        points_per_pixel,
+                        ..Limits::default()
+                    };
+                    let scheme = |&quantiser| Scheme::Residual(quantiser, limits);
+                    args.steps.iter().map(scheme).collect()
+                };
+                args.points_per_pixel.iter().map(group).collect()
             }
         };
-        bounded(&world, schemes.len())?;
+        bounded(&world, groups[0].len())?;
         let aspect = args.size.0 as f32 / args.size.1 as f32;
         let path = camera_path(&world, args.path, aspect)?;
 
@@ -354,15 +378,18 @@ impl Bench<'_> {
         let converging = |done, total| progress(&stage("convergence"), done, total);
         world.converge(&seen, world.options.rays, &converging);
 
-        for &rate_hz in &args.rates {
+        let runs = args.rates.iter();
+        let runs = runs.flat_map(|&rate| groups.iter().map(move |group| (rate, group)));
+        for (rate_hz, schemes) in runs {
             // Back to the start, with all that will be seen as it is then.
             world.eyes.clear();
+            world.finest_levels.clear();
             world.step(0.0, &seen, u64::MAX);
             world.converge(&seen, world.options.rays, &|_, _| ());
             world.clear_changes();
             let name = format!("{rate_hz} Hz");
             let frames = |done, total| progress(&stage(&name), done, total);
-            self.rate(&mut world, &path, rate_hz, &schemes, found, &frames)?;
+            self.rate(&mut world, &path, rate_hz, schemes, found, &frames)?;
         }
         Ok(())
     }
@@ -393,6 +420,12 @@ impl Bench<'_> {
             };
             let start = Instant::now();
             world.eyes = vec![path.at(time).position];
+            let finest = &mut world.finest_levels;
+            finest.clear();
+            finest.resize(world.scene.instances.len(), LEVELS);
+            for stream in &streams {
+                stream.encoder.want_levels(finest);
+            }
             let step = world.step(time, &visible, u64::MAX);
             step_ms.push(ms(start));
             rays.push(step.rays as f64);
@@ -614,6 +647,10 @@ impl Stream {
                 Scheme::Residual(..) => ProfileArg::Residual.name(),
             },
             quant: name_of(self.scheme),
+            points_per_pixel: match self.scheme {
+                Scheme::Cells { .. } => 0.0,
+                Scheme::Residual(_, limits) => limits.points_per_pixel,
+            },
             mbit_per_s: mean(&kbits[steady..]) * rate_hz / 1e3,
             mbit_per_s_slices: mean(&of(&|frame| frame.slices_bytes as f64)) * 8e-6 * rate_hz,
             mbit_per_s_topology: mean(&of(&|frame| frame.topology_bytes as f64)) * 8e-6 * rate_hz,
@@ -652,6 +689,14 @@ fn name_of(scheme: Scheme) -> String {
         Scheme::Residual(Quantiser { step, dead_zone }, _) => {
             format!("step {step}, dead zone {dead_zone}")
         }
+    }
+}
+
+/// Level of detail in words.
+fn per_pixel(points: f32) -> String {
+    match points {
+        0.0 => String::new(),
+        points => format!(" to {points}/pixel"),
     }
 }
 
@@ -726,13 +771,14 @@ fn aligned<const N: usize>(lines: &[[String; N]]) -> String {
 }
 
 impl Evaluation {
-    fn compare(&mut self, density: f64, rate_hz: f64) {
+    fn compare(&mut self, density: f64, rate_hz: f64, points_per_pixel: f32) {
         let of = |profile: ProfileArg| -> Vec<&Row> {
             let rows = self.rows.iter().filter(|row| row.profile == profile.name());
             rows.filter(|row| row.density == density && row.rate_hz == rate_hz)
                 .collect()
         };
-        let residual = of(ProfileArg::Residual);
+        let mut residual = of(ProfileArg::Residual);
+        residual.retain(|row| row.points_per_pixel == points_per_pixel);
         let off = |row: &Row, from: f64| (row.rmse_255 - from).abs();
         let Some(cells) = of(ProfileArg::Cells).first().copied() else {
             return;
@@ -750,6 +796,7 @@ impl Evaluation {
         let comparison = Comparison {
             density,
             rate_hz,
+            points_per_pixel,
             rmse_255: cells.rmse_255,
             bits_cells_over_residual: bits.map(|(bits, _)| cells.mbit_per_s / bits),
             bits_cells_over_residual_shipped: shipped.map(|(bits, _)| cells.mbit_per_s / bits),
@@ -768,6 +815,7 @@ impl Evaluation {
             "profile",
             "quantiser",
             "/m²",
+            "/pixel",
             "Hz",
             "Mbit/s",
             "slices",
@@ -798,6 +846,10 @@ impl Evaluation {
                 row.profile.into(),
                 row.quant.clone(),
                 row.density.to_string(),
+                match row.points_per_pixel {
+                    0.0 => "all".into(),
+                    points => points.to_string(),
+                },
                 row.rate_hz.to_string(),
                 format!("{:.2}", row.mbit_per_s),
                 format!("{:.2}", row.mbit_per_s_slices),
@@ -837,7 +889,12 @@ impl Evaluation {
                 None => "unknown (needs two --steps and some bits)".into(),
             };
             lines.push((
-                format!("{}/m², {} Hz", found.density, found.rate_hz),
+                format!(
+                    "{}/m²{}, {} Hz",
+                    found.density,
+                    per_pixel(found.points_per_pixel),
+                    found.rate_hz
+                ),
                 format!(
                     "bits of cells over residual at {:.3}/255 rms {bits}, with the topology \
                      shipped {}; at {} ({:.3}/255): \
@@ -872,14 +929,58 @@ impl Evaluation {
         lines
     }
 
+    /// What more points cost: a plot a profile, quantiser, rate and number of points a pixel that
+    /// was measured at several densities.
+    fn growth(&self) -> Vec<Plot> {
+        let mut runs: Vec<(String, Vec<&Row>)> = Vec::new();
+        for row in &self.rows {
+            let thinned = per_pixel(row.points_per_pixel);
+            let run = format!("{} {}{thinned}, {} Hz", row.profile, row.quant, row.rate_hz);
+            match runs.iter_mut().find(|(name, _)| *name == run) {
+                Some((_, rows)) => rows.push(row),
+                None => runs.push((run, vec![row])),
+            }
+        }
+        runs.retain(|(_, rows)| rows.len() > 1);
+        let plot = |(run, mut rows): (String, Vec<&Row>)| {
+            rows.sort_by(|a, b| a.density.total_cmp(&b.density));
+            let costs: [(&str, fn(&Row) -> f64); 5] = [
+                ("step", |row| row.step_ms),
+                ("select and encode", |row| row.select_ms + row.encode_ms),
+                ("decode", |row| row.decode_ms),
+                ("Mbit/s", |row| row.mbit_per_s),
+                ("Mbit/s, topology shipped", |row| {
+                    row.mbit_per_s - row.mbit_per_s_topology
+                }),
+            ];
+            let curve = |(name, cost): (&str, fn(&Row) -> f64)| {
+                let ratio = |row: &&Row| (row.density, cost(row) / cost(rows[0]));
+                (name.into(), rows.iter().map(ratio).collect())
+            };
+            Plot {
+                title: format!("Growth, {run}"),
+                x_label: "points per m²".into(),
+                y_label: "times the least density's".into(),
+                series: costs.into_iter().map(curve).collect(),
+                log_y: false,
+                form: Form::Lines,
+            }
+        };
+        runs.into_iter().map(plot).collect()
+    }
+
     fn report(&self) -> Report {
         let scene = self.rows.first().map_or("", |row| &row.scene);
         let mut summary = self.conclusions();
         for row in &self.rows {
             summary.push((
                 format!(
-                    "{} {}, {}/m², {} Hz",
-                    row.profile, row.quant, row.density, row.rate_hz
+                    "{} {}, {}/m²{}, {} Hz",
+                    row.profile,
+                    row.quant,
+                    row.density,
+                    per_pixel(row.points_per_pixel),
+                    row.rate_hz
                 ),
                 format!(
                     "{:.2} Mbit/s, {:.3}/255 rms, {:.2} dB, decode {:.3} ms, encode {:.3} ms",
@@ -895,7 +996,14 @@ impl Evaluation {
         let curves = |x: &dyn Fn(&Row) -> f64, y: &dyn Fn(&Row) -> f64| {
             let mut curves: Vec<(String, Vec<(f64, f64)>)> = Vec::new();
             for row in &self.rows {
-                let name = format!("{}, {}/m², {} Hz", row.profile, row.density, row.rate_hz);
+                let Row {
+                    profile,
+                    density,
+                    rate_hz,
+                    ..
+                } = row;
+                let thinned = per_pixel(row.points_per_pixel);
+                let name = format!("{profile}, {density}/m²{thinned}, {rate_hz} Hz");
                 if curves.last().is_none_or(|(last, _)| *last != name) {
                     curves.push((name, Vec::new()));
                 }
@@ -945,7 +1053,8 @@ impl Evaluation {
         for (row, kbits) in self.rows.iter().zip(&self.kbits) {
             let key = (row.density.to_bits(), row.rate_hz.to_bits());
             let times = (0..).map(|frame| f64::from(frame) / row.rate_hz);
-            let name = format!("{} {}", row.profile, row.quant);
+            let thinned = per_pixel(row.points_per_pixel);
+            let name = format!("{} {}{thinned}", row.profile, row.quant);
             let line = times.zip(kbits.iter().copied()).collect();
             over_time.entry(key).or_default().push((name, line));
         }
@@ -954,6 +1063,7 @@ impl Evaluation {
             let title = format!("Bits of each frame, {density}/m², {rate_hz} Hz");
             plots.push(plot(&title, "time (s)", "kbit", series));
         }
+        plots.extend(self.growth());
         Report {
             title: format!("PSAO eval: {scene}"),
             summary,

@@ -7,6 +7,7 @@ use crate::world::{StepStats, World};
 use glam::{Affine3A, DAffine3, DVec3, Vec3};
 use psao::memory::Heap;
 use psao_core::Mirror;
+use psao_core::topology::LEVELS;
 use psao_core::uplink::{self, Presence};
 use std::collections::BTreeMap;
 use std::time::Instant;
@@ -227,6 +228,12 @@ impl Server {
         let eyes = viewers.values().map(|viewer| viewer.eye);
         let eyes = eyes.map(|eye| eye.map(|eye| eye.camera.position));
         self.world.eyes = eyes.collect::<Option<_>>().unwrap_or_default();
+        let finest = &mut self.world.finest_levels;
+        finest.clear();
+        finest.resize(self.world.scene.instances.len(), LEVELS);
+        for viewer in viewers.values() {
+            viewer.encoder.want_levels(finest);
+        }
         let stats = self.world.step(time_s, &visible, converge_rays);
         self.time_ns = (time_s * 1e9) as u64;
         self.frames += 1;

@@ -202,6 +202,10 @@ pub struct World {
     /// Where clients look from, metres from the scene's origin: points near what moves are only
     /// brought up to date when they may face one ([`World::facing`]). None: all are.
     pub eyes: Vec<Vec3>,
+    /// In rest space, of each instance the finest level of detail that a client has: points of
+    /// finer levels wait, when something moves near them, until a client has them. An instance
+    /// after the last, or of level 0, has all its points brought up to date.
+    pub finest_levels: Vec<u32>,
     /// Instances' grids; and, unless [`Options::rest_space`], buckets and cells.
     pub truth: Truth,
     /// With [`Options::rest_space`], points a mesh.
@@ -242,6 +246,8 @@ pub struct World {
     turns: Vec<Turn>,
     /// The blocks of all slices, [`SLICE_BLOCKS`] each.
     blocks: Vec<Block>,
+    /// [`World::finest_levels`] of the last step, of every instance.
+    stepped_levels: Vec<u32>,
     /// Calls of [`World::step`].
     steps: u64,
     /// Space for what the traced points say, kept from step to step.
@@ -311,6 +317,8 @@ impl World {
             turns: Vec::new(),
             blocks: Vec::new(),
             eyes: Vec::new(),
+            finest_levels: Vec::new(),
+            stepped_levels: vec![0; scene.instances.len()],
             steps: 0,
             traced: Vec::new(),
             driven: BTreeMap::new(),
@@ -645,6 +653,7 @@ impl World {
         self.pose_at(time_s);
         self.mark_stale();
         self.place_deforming(visible);
+        self.owe_finer_levels();
         self.trace(
             visible,
             converge_rays,
@@ -744,6 +753,27 @@ impl World {
                 *instance != slice.instance && hulls.iter().any(near)
             });
         }
+    }
+
+    /// Where a finer level is wanted than at the last step, its points may have missed something.
+    fn owe_finer_levels(&mut self) {
+        for instance in 0..self.stepped_levels.len() as u32 {
+            let now = self.finest_level(instance);
+            let before = std::mem::replace(&mut self.stepped_levels[instance as usize], now);
+            if now < before {
+                for slice in self.slices_of(instance) {
+                    let turn = &mut self.turns[slice as usize];
+                    turn.owed |= turn.missed;
+                    turn.had |= turn.missed;
+                }
+            }
+        }
+    }
+
+    /// The finest level of an instance that is kept up to date.
+    fn finest_level(&self, instance: u32) -> u32 {
+        let wanted = self.finest_levels.get(instance as usize);
+        wanted.copied().unwrap_or(0)
     }
 
     /// Moves the points of visible deforming instances to their cells in the present pose.
@@ -1070,9 +1100,18 @@ impl World {
             .reduce(|| (0, 0), |a, b| (a.0 + b.0, a.1 + b.1));
         let mut batches = batches.iter().peekable();
         for due in due {
+            let slice = &self.slices[due.slice];
+            // An instance has no points of finer levels than its own.
+            let whole = due.rays > slice.rays_done
+                || Some(self.finest_level(slice.instance)) <= self.level_of(slice.instance);
             let turn = &mut self.turns[due.slice];
             turn.owed &= !due.blocks;
             turn.had = turn.had & !due.blocks | turn.near & due.blocks;
+            if whole {
+                turn.missed &= !due.blocks;
+            } else {
+                turn.missed |= due.blocks;
+            }
             let mut changed = 0;
             while let Some(batch) = batches.next_if(|batch| batch.slice == due.slice) {
                 changed |= self.take_in(batch);
@@ -1210,6 +1249,11 @@ impl World {
         let t_max = self.options.ao_distance_m;
         let (rays, words) = (batch.rays, self.words());
         let converging = rays > slice.rays_done;
+        // Bits that stay are found for all points at once.
+        let finest = match converging {
+            true => 0,
+            false => self.finest_level(instance),
+        };
         let near = |hull: &Hull| hull.is_near(slice.bounds, t_max);
         let movers = (0..self.moves.len()).filter(|&mover| self.moves[mover]);
         let movers: Vec<Hull> = movers
@@ -1225,6 +1269,11 @@ impl World {
         for (number, (fixed, occlusion)) in batch.points.clone().zip(parts) {
             let block = (number - batch.points.start) as usize / BLOCK;
             if batch.blocks >> block & 1 == 0 {
+                continue;
+            }
+            let level = self.levels.get(number as usize);
+            if level.is_some_and(|level| u32::from(*level) < finest) {
+                *occlusion = self.occlusion[number as usize];
                 continue;
             }
             let point = &self.points[number as usize];
@@ -1738,6 +1787,8 @@ struct Turn {
     /// Those that movers reach, and those that they reached when they were traced last.
     near: u64,
     had: u64,
+    /// Those of which only points of [`World::finest_levels`] were traced since something moved.
+    missed: u64,
     /// The step at which the slice was visible last; it was not at the one before.
     seen_at: u64,
     is_new: bool,

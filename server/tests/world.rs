@@ -398,6 +398,36 @@ fn points_that_face_no_eye_wait_until_they_face_one() {
 }
 
 #[test]
+fn points_of_levels_that_no_client_has_wait_until_one_has_them() {
+    const COARSE: u32 = 2;
+    let options = laid_out(options(256.0, 64), residual());
+    let mut whole = world(small_scene(), options.clone());
+    let mut thin = world(small_scene(), options);
+    for world in [&mut whole, &mut thin] {
+        converge(world);
+    }
+    thin.finest_levels = vec![COARSE; thin.scene.instances.len()];
+    let mut rays = [0, 0];
+    // At the end what moved is where it was not, and where it was it no longer is.
+    for time in [0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 1.1] {
+        for (world, rays) in [&mut whole, &mut thin].into_iter().zip(&mut rays) {
+            *rays += world.step(time, &all, 0).rays;
+        }
+        for (slice, other) in thin.slices.iter().zip(&whole.slices) {
+            let pairs = thin.occlusion(slice).iter().zip(whole.occlusion(other));
+            for ((said, truth), level) in pairs.zip(thin.levels(slice)) {
+                assert!(u32::from(*level) < COARSE || said == truth);
+            }
+        }
+    }
+    assert!(rays[1] * 2 < rays[0], "{rays:?}");
+    assert!(!says_the_same(&whole, &thin));
+    thin.finest_levels.clear();
+    thin.step(1.1, &all, 0);
+    assert!(says_the_same(&whole, &thin));
+}
+
+#[test]
 fn in_rest_space_blocks_that_no_mover_reaches_are_left_alone_and_say_the_truth() {
     let options = laid_out(options(256.0, 64), residual());
     let mut stepped = world(small_scene(), options.clone());

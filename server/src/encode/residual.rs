@@ -187,6 +187,14 @@ impl Residual {
         }
     }
 
+    /// Lowers each instance's level to the finest that the client has, or may get at once.
+    pub fn want_levels(&self, finest: &mut [u32]) {
+        for (finest, has) in finest.iter_mut().zip(self.mirror.instances()) {
+            let level = if has.bucket_count > 0 { has.level } else { 0 };
+            *finest = level.min(*finest);
+        }
+    }
+
     /// What was sent counts against the budget of this frame; what was too much, of the next.
     pub fn spent(&mut self, bytes: u64) {
         if self.limits.max_mbit > 0.0 {
