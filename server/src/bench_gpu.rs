@@ -48,6 +48,10 @@ pub struct BenchGpuArgs {
     /// Folder for report.html, with the plot, and pictures of the first 4 frames as PNG
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
+    /// Also one ray a pixel by the device's own ray queries, where it has them. wgpu calls them
+    /// experimental: a faulty driver may do anything
+    #[arg(long)]
+    pub ray_query: bool,
 }
 
 /// Seconds between two places along the path.
@@ -185,16 +189,17 @@ impl Work<'_> {
     }
 }
 
-/// Runs the race; ray queries take part where `experimental` allows them and the device has them.
+/// Runs the race.
 ///
 /// # Errors
 /// What went wrong, and what to do about it: no GPU, none with timestamps, or a lookup or rays that
 /// are not what they have to be.
-pub fn run(
-    args: &BenchGpuArgs,
-    experimental: wgpu::ExperimentalFeatures,
-    progress: Progress<'_>,
-) -> Result<Race, String> {
+pub fn run(args: &BenchGpuArgs, progress: Progress<'_>) -> Result<Race, String> {
+    let experimental = if args.ray_query {
+        psao_experimental::ray_queries()
+    } else {
+        wgpu::ExperimentalFeatures::disabled()
+    };
     let gpu = Gpu::open_with(experimental)?;
     let mut watch = Stopwatch::new(&gpu)?;
     let mut world = args.scene.world(true, progress)?;

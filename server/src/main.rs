@@ -83,14 +83,10 @@ fn main() -> ExitCode {
             report.table()
         }),
         #[cfg(feature = "gpu")]
-        Command::BenchGpu(args) => {
-            // Only unsafe code may accept what wgpu calls experimental, and there is none here.
-            let experimental = wgpu::ExperimentalFeatures::disabled();
-            bench_gpu::run(args, experimental, &progress).map(|race| {
-                bars.finish();
-                race.table()
-            })
-        }
+        Command::BenchGpu(args) => bench_gpu::run(args, &progress).map(|race| {
+            bars.finish();
+            race.table()
+        }),
     };
     let result = result.and_then(|text| {
         let written = std::io::stdout().write_all(text.as_bytes());

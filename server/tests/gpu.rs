@@ -579,8 +579,7 @@ fn the_race_checks_and_times_every_method_and_keeps_its_pictures() {
     let args = "psao --density 16 --rays 32 --size 96x54 --frames 2".split(' ');
     let mut args = Bench::parse_from(args).args;
     (args.out, args.json) = (Some(out.clone()), Some(json.clone()));
-    let experimental = wgpu::ExperimentalFeatures::disabled();
-    let race = bench_gpu::run(&args, experimental, &|_, _, _| ()).expect("a device that times");
+    let race = bench_gpu::run(&args, &|_, _, _| ()).expect("a device that times");
     println!("{}", race.table());
     assert!(race.exact_off_255 <= 1.0 && race.fast_off_255 <= 4.0);
     assert_eq!(race.rows.len(), 6);

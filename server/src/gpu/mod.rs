@@ -75,7 +75,7 @@ impl Gpu {
         let no_ray_query = if !adapter.features().contains(RAY_QUERY) {
             Some("not on this adapter")
         } else if !experimental.is_enabled() {
-            Some("not asked for: experimental in wgpu")
+            Some("not asked for: --ray-query")
         } else {
             None
         };

@@ -298,7 +298,7 @@ impl GpuTracer {
                 gpu,
                 "fans",
                 pipeline,
-                &[&self.scene(), &asked_of],
+                &[&self.scene(self.nodes.as_entire_binding()), &asked_of],
                 workgroups,
             );
             let mut encoder = gpu.encoder();
