@@ -126,13 +126,15 @@ impl TraceArgs {
                     .into(),
             );
         }
-        let mut world = scene.world(rest_space, progress)?;
+        let world = scene.world(rest_space, progress)?;
         #[cfg(feature = "gpu")]
         if self.trace == DeviceArg::Gpu {
+            let mut world = world;
             let (pose, rays) = (&world.pose, world.options.rays);
             let device = StillTracer::open(&world.scene, pose, rays, world.moves());
             let device = device.map_err(|error| format!("--trace gpu: {error}"))?;
             world.trace_still_on(Box::new(device));
+            return Ok(world);
         }
         Ok(world)
     }
