@@ -1424,7 +1424,8 @@ impl World {
 
     /// In rest space: the level of detail that an instance's scale asks for, if it has points.
     pub fn level_of(&self, instance: u32) -> Option<u32> {
-        self.topology.of_instance[instance as usize].map(|(_, level)| level)
+        let own = self.topology.of_instance.get(instance as usize)?;
+        own.map(|(_, level)| level)
     }
 
     /// In rest space: an instance's grid at a level of detail, not below [`World::level_of`].
