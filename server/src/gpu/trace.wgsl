@@ -126,39 +126,3 @@ fn pixels(@builtin(global_invocation_id) id: vec3<u32>) {
     let all = f32(trees.first + trees.rays);
     textureStore(openness, id.xy, vec4((before + f32(open)) / all));
 }
-
-// Rays from one place, in the directions of a set.
-struct Fan {
-    origin: vec3<f32>,
-    own_set: u32,
-    x: vec3<f32>,
-    y: vec3<f32>,
-    normal: vec3<f32>,
-}
-
-@group(1) @binding(7) var<storage, read> asked: array<Fan>;
-// In: rays to trace, in the set's sorted order. Out: those of them that hit.
-@group(1) @binding(8) var<storage, read_write> fan_bits: array<u32>;
-
-// A word of a fan's rays, which go nearly the same way, against what stands still.
-@compute @workgroup_size(64)
-fn fans(@builtin(global_invocation_id) id: vec3<u32>) {
-    if id.x >= trees.rays {
-        return;
-    }
-    let fan = asked[id.x / trees.fan_words];
-    let own = fan.own_set * (arrayLength(&directions) / SETS);
-    let first = own + id.x % trees.fan_words * 32u;
-    var open = fan_bits[id.x];
-    var found = 0u;
-    while open != 0u && trees.fixed_nodes > 0u {
-        let i = firstTrailingBit(open);
-        open &= open - 1u;
-        let d = directions[own + u32(directions[first + i].w)].xyz;
-        let direction = fan.x * d.x + fan.y * d.y + fan.normal * d.z;
-        if tree_occludes(0u, 0u, fan.origin, direction, trees.t_max) {
-            found |= 1u << i;
-        }
-    }
-    fan_bits[id.x] = found;
-}
