@@ -50,6 +50,13 @@ const BATCH: usize = 64;
 /// Frames over which a change of the level of detail is faded, at least.
 const FADE_S: f32 = 0.4;
 
+/// A slice waits while what it is off by, squared and summed over its points, is less than this many
+/// squares of the least difference that counts: what comes of it later costs hardly more bits.
+const LITTLE: u64 = 25;
+
+/// No slice waits longer for being little off.
+const WAIT_S: f32 = 0.1;
+
 /// What a client of profile `residual` has.
 pub struct Residual {
     pub mirror: Mirror<Heap>,
@@ -63,6 +70,8 @@ pub struct Residual {
     has_patch: Vec<bool>,
     /// Of each slice, the blocks whose occlusion, or place in cells, may differ from the client's.
     due: Vec<u64>,
+    /// The frame since which a slice has been a little off.
+    little_since: Vec<Option<u64>>,
     sight: Sight,
     /// Slices on their way from one level's picture to another's.
     fades: BTreeMap<u32, Fade>,
@@ -98,6 +107,15 @@ struct Lack {
     free: PointBits,
     /// Visible error: squared, over all other points, a square metre's part of the picture.
     weight: f32,
+}
+
+/// How much a client lacks of a slice.
+enum Off {
+    /// Nothing that counts.
+    Near,
+    /// So little that it may wait.
+    Little,
+    Far,
 }
 
 /// A slice, coded.
@@ -138,6 +156,7 @@ impl Residual {
             limits,
             has_patch: vec![has_patches; capacity.patches as usize],
             due: vec![u64::MAX; world.slices.len()],
+            little_since: vec![None; world.slices.len()],
             sight: Sight::new(world.slices.len()),
             fades: BTreeMap::new(),
             space: Space::new(capacity.points),
@@ -259,28 +278,35 @@ impl Residual {
         packets
     }
 
-    /// The slices in sight that the client does not have, or that differ where it shows.
+    /// The slices in sight that the client does not have, or that differ where it shows by more than
+    /// a little, or have for a while.
     fn lacks(&mut self, world: &World, view: &View<'_>) -> Vec<Lack> {
         let this = &*self;
         let needed = this.sight.needed().par_iter();
-        let checked: Vec<(Lack, bool)> = needed
+        let checked: Vec<(Lack, Off)> = needed
             .filter_map(|&index| this.check(world, view, index))
             .collect();
         let mut lacks = Vec::new();
-        for (lack, differs) in checked {
-            if differs {
-                lacks.push(lack);
-            } else {
-                // Near enough until the world changes it again.
-                self.due[lack.index as usize] &= !lack.blocks;
+        let now = self.sight.frames();
+        let patience = (WAIT_S * self.rate_hz) as u64;
+        for (lack, off) in checked {
+            let since = &mut self.little_since[lack.index as usize];
+            match off {
+                Off::Near => {
+                    // Until the world changes it again.
+                    self.due[lack.index as usize] &= !lack.blocks;
+                    *since = None;
+                }
+                Off::Little if now - *since.get_or_insert(now) < patience => {}
+                Off::Little | Off::Far => lacks.push(lack),
             }
         }
         lacks
     }
 
-    /// What the client needs of a slice in sight, and whether it lacks that; `None` if none of it
+    /// What the client needs of a slice in sight, and how much it lacks of that; `None` if none of it
     /// may have changed.
-    fn check(&self, world: &World, view: &View<'_>, index: u32) -> Option<(Lack, bool)> {
+    fn check(&self, world: &World, view: &View<'_>, index: u32) -> Option<(Lack, Off)> {
         let slice = &world.slices[index as usize];
         let open = &self.heap.get()[index as usize];
         let opens = open.point_count == 0;
@@ -305,7 +331,7 @@ impl Residual {
             let want = world.occlusion(slice).iter();
             let dark: u64 = want.map(|w| u64::from(255 - w).pow(2)).sum();
             lack.weight = (dark + want_a_little(slice)) as f32 / near();
-            return Some((lack, true));
+            return Some((lack, Off::Far));
         }
         if !fading {
             let Faces { any, all } = view.blocks(world, slice, due);
@@ -327,11 +353,18 @@ impl Residual {
         let missing = to_show(world, &self.mirror, slice, open) & !open.shown;
         let shows = missing & lack.blocks != 0;
         lack.weight = (squares as f32 + f32::from(u8::from(shows))) / near();
-        let differs = squares > 0 || shows || fading;
-        if !differs {
+        let dead_zone = u64::from(self.quantiser.dead_zone);
+        let off = if shows || fading {
+            Off::Far
+        } else if squares == 0 {
             lack.blocks &= near_enough;
-        }
-        Some((lack, differs))
+            Off::Near
+        } else if dead_zone > 0 && squares < LITTLE * (dead_zone + 1).pow(2) {
+            Off::Little
+        } else {
+            Off::Far
+        };
+        Some((lack, off))
     }
 
     /// Takes instances from the client that are out of the scene.
@@ -585,6 +618,7 @@ impl Residual {
             None if shown != slice.shown => Operation::Show(shown),
             None => Operation::Update,
         };
+        self.little_since[index as usize] = None;
         stats.opened += u32::from(coded.opens.is_some());
         stats.slices += 1;
         out.items
