@@ -566,8 +566,10 @@ impl Residual {
                 ready.push((lack, None));
             }
         }
+        // A few slices take less time than another thread to wake up.
         let coded: Vec<Coded> = ready
             .par_iter()
+            .with_min_len(BATCH / 2)
             .map(|&(lack, opens)| self.code(world, lack, opens))
             .collect();
         for coded in coded {
