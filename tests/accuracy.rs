@@ -79,9 +79,9 @@ fn leak(scene: Scene, places: &[[Vec3; 2]], other: &dyn Fn(Vec3, Vec3) -> bool) 
     off.fold(0.0, f32::max)
 }
 
-/// Two rooms: a wall of this thickness at x = 0 on a floor that both share. A panel close to its
-/// far side makes it dark there.
-fn rooms(thick: f32, floor_first: bool) -> Scene {
+/// Two rooms: a wall of this thickness at x = 0 on a floor of this width that both share. A panel
+/// close to its far side makes it dark there.
+fn rooms(thick: f32, width: f32, floor_first: bool) -> Scene {
     let mut scene = Scene::default();
     let half = thick * 0.5;
     let mut wall = mesh("wall", false);
@@ -106,8 +106,8 @@ fn rooms(thick: f32, floor_first: bool) -> Scene {
     let mut floor = mesh("floor", false);
     quad(
         &mut floor,
-        Vec3::new(-1.5, 0.0, -1.0),
-        Vec3::Z * 2.0,
+        Vec3::new(-1.5, 0.0, -width * 0.5),
+        Vec3::Z * width,
         Vec3::X * 3.0,
     );
     let mut panel = mesh("panel", true);
@@ -135,25 +135,30 @@ fn spread(corner: Vec3, u: Vec3, v: Vec3) -> Vec<[Vec3; 2]> {
 
 #[test]
 fn what_lies_behind_a_wall_does_not_show_on_it() {
-    println!("| thickness | the wall, 1/255 | a floor that goes on below it, 1/255 |");
+    println!("| thickness | the wall, 1/255 | floors that go on below it, 1/255 |");
     println!("|---|---|---|");
     for thick in [0.01, 0.02, 0.05, 0.1f32] {
         let half = thick * 0.5;
         let on_wall = spread(Vec3::new(-half, 0.0, -1.0), Vec3::Z * 2.0, Vec3::Y * 2.0);
         let behind = |p: Vec3, n: Vec3| p.x > -half * 0.5 || n.x > 0.5;
-        let wall = leak(rooms(thick, false), &on_wall, &|p, n| {
+        let wall = leak(rooms(thick, 2.0, false), &on_wall, &|p, n| {
             n.x > -0.5 && behind(p, n)
         });
         let on_floor = spread(
-            Vec3::new(-0.5, 0.0, -1.0),
-            Vec3::Z * 2.0,
+            Vec3::new(-0.5, 0.0, -0.9),
+            Vec3::Z * 1.8,
             Vec3::X * (0.5 - half),
         );
-        let floor = leak(rooms(thick, true), &on_floor, &|p, _| p.x > half);
+        // The points of each floor are others.
+        let floors = [2.0, 1.9, 1.95, 2.05, 2.1, 2.15, 2.2, 2.3].map(|width| {
+            let scene = rooms(thick, width, true);
+            leak(scene, &on_floor, &|p, _| p.x > half)
+        });
+        let floor = floors.into_iter().fold(0.0, f32::max);
         println!("| {} cm | {wall:.2} | {floor:.2} |", thick * 100.0);
         assert!(
-            thick < 0.05 || wall <= 2.0,
-            "{wall} through a wall of {thick} m"
+            thick < 0.05 || wall <= 2.0 && floor <= 2.0,
+            "{wall} through a wall of {thick} m, {floor} below it"
         );
     }
 }

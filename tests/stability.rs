@@ -66,7 +66,7 @@ fn reference(
             let openness = f64::from(point.occlusion()) / 255.0;
             let mut weight = weight(kernel, d, radius, normal, normal_of(point.normal()));
             if kernel == Kernel::Planar {
-                weight *= (5.0 * openness).min(1.0) + 0.001;
+                weight *= (5.0 * openness).min(1.0).powi(2) + 0.0001;
                 for axis in 0..3 {
                     let place = g[axis] - base[axis];
                     let upper = cell[axis] > base[axis];
@@ -94,8 +94,9 @@ fn weight(kernel: Kernel, d: DVec3, radius: f64, n: DVec3, n_p: DVec3) -> f64 {
         }
         Kernel::Planar => {
             let h = n.dot(d).abs().max(n_p.dot(d).abs());
-            let far = (d.length_squared() + 11.0 * h * h) / (radius * radius);
-            agree.max(0.1).powi(8) / (0.2 + far).powi(2)
+            let squared = d.length_squared() / (radius * radius);
+            let far = squared + 30.0 * h * h / (radius * radius);
+            (1.0 - squared / 1.2).max(0.001) * agree.max(0.1).powi(8) / (0.5 + far).powi(2)
         }
     }
 }

@@ -28,17 +28,21 @@ const PSAO_T_N: f32 = 0.1;
 // `paper`: points that lie this much above or below their own plane do not count.
 const PSAO_T_D: f32 = 0.7;
 // `planar`: squared distances from the planes count this much more than those along them.
-const PSAO_FLATNESS: f32 = 11.0;
+const PSAO_FLATNESS: f32 = 30.0;
 // `planar`: the squared distance, in radii, from which weights begin to fall.
-const PSAO_CORE: f32 = 0.2;
+const PSAO_CORE: f32 = 0.5;
+// `planar`: the squared distance, in radii, from which points count next to nothing, and what is
+// left of their weight there.
+const PSAO_REACH: f32 = 1.2;
+const PSAO_BEYOND: f32 = 0.001;
 // `planar`: how far before the block switches the cells fade that it will leave, in cells.
 const PSAO_FADE: f32 = 0.3;
-// `planar`: points less open than this count less, in proportion.
+// `planar`: points less open than this count less, by the square.
 const PSAO_SEEN: f32 = 0.2;
 // `planar`: what a point counts at least, however dark.
-const PSAO_UNSEEN: f32 = 0.001;
+const PSAO_UNSEEN: f32 = 0.0001;
 // From this weight on, points that are not dark are near.
-const PSAO_NEAR: f32 = 0.5;
+const PSAO_NEAR: f32 = 0.05;
 // The kernel `paper`, as the stream's header numbers it.
 const PSAO_PAPER: u32 = 0u;
 // A bucket's entry: the cell's index, and above it a tag of its key (psao_tag) or 0 for none.
@@ -168,10 +172,12 @@ fn psao_planar_weight(
 ) -> f32 {
     let agree = max(dot(point_normal, normal), PSAO_T_N);
     let h = max(abs(dot(normal, d)), abs(dot(point_normal, d)));
-    let apart = PSAO_CORE + (dot(d, d) + PSAO_FLATNESS * (h * h)) / (radius * radius);
+    let squared = dot(d, d);
+    let apart = PSAO_CORE + (squared + PSAO_FLATNESS * (h * h)) / (radius * radius);
+    let in_reach = max(1.0 - squared / (PSAO_REACH * radius * radius), PSAO_BEYOND);
     let agree2 = agree * agree;
     let agree4 = agree2 * agree2;
-    return agree4 * agree4 / (apart * apart);
+    return in_reach * agree4 * agree4 / (apart * apart);
 }
 
 // How much the lower and the upper cells of a block count along the axes, for a fragment at this
@@ -184,7 +190,8 @@ fn psao_side(place: vec3<f32>, offset: vec3<u32>) -> f32 {
 
 // How much a point of this openness counts for `planar`.
 fn psao_seen(openness: f32) -> f32 {
-    return min(openness / PSAO_SEEN, 1.0) + PSAO_UNSEEN;
+    let lit = min(openness / PSAO_SEEN, 1.0);
+    return lit * lit + PSAO_UNSEEN;
 }
 
 // The blend, written plainly: each of the 8 cells is found, each of its points weighed. The
@@ -241,8 +248,9 @@ fn psao_blend(planar: bool, instance: u32, position: vec3<f32>, normal: vec3<f32
     return vec2<f32>(1.0, 0.0);
 }
 
-// s · (min(1, 5o) + 0.001) · max(0.1, n·nₚ)⁸ / (0.2 + (d² + 11h²)/r²)² with
-// h = max(|n·d|, |nₚ·d|), o the point's openness and s its cell's part; open where no point is.
+// s · (min(1, 5o)² + 0.0001) · max(0.001, 1 − d²/1.2r²) · max(0.1, n·nₚ)⁸
+// / (0.5 + (d² + 30h²)/r²)² with h = max(|n·d|, |nₚ·d|), o the point's openness and s its cell's
+// part; open where no point is.
 fn psao_planar(instance: u32, position: vec3<f32>, normal: vec3<f32>) -> f32 {
     return psao_blend(true, instance, position, normal).x;
 }
@@ -473,7 +481,8 @@ fn psao_point(point: u32) -> PsaoPoint {
     let fold = max(-z, 0.0);
     let m = vec3<f32>(uv - select(vec2<f32>(fold), vec2<f32>(-fold), uv < vec2<f32>(0.0)), z);
     let openness = f32(i32(point & 255u));
-    let seen = min(openness * (1.0 / (255.0 * PSAO_SEEN)), 1.0) + PSAO_UNSEEN;
+    let lit = min(openness * (1.0 / (255.0 * PSAO_SEEN)), 1.0);
+    let seen = fma(lit, lit, PSAO_UNSEEN);
     return PsaoPoint(
         vec3<f32>(steps) * scale,
         m,
@@ -505,10 +514,12 @@ fn psao_add(
     let along = psao_dot(normal, d);
     let point_along = psao_dot(point.normal, d);
     let h2 = max(along * along * point.square, point_along * point_along);
-    let near = fma(psao_dot(d, d), inverse_radius2, PSAO_CORE) * point.square;
+    let squared = psao_dot(d, d);
+    let in_reach = max(fma(squared, inverse_radius2 * (-1.0 / PSAO_REACH), 1.0), PSAO_BEYOND);
+    let near = fma(squared, inverse_radius2, PSAO_CORE) * point.square;
     let apart = fma(h2, PSAO_FLATNESS * inverse_radius2, near);
     let ratio = agree2 * agree2 / (apart * point.square);
-    let weight = share * point.seen * (ratio * ratio);
+    let weight = share * point.seen * in_reach * (ratio * ratio);
     return fma(vec2<f32>(weight), vec2<f32>(1.0, point.openness), sums);
 }
 

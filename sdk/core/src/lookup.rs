@@ -16,24 +16,32 @@ pub const T_D: f32 = 0.7;
 
 /// [`Kernel::Planar`]: squared distances from the planes count this much more than those along
 /// them.
-pub const FLATNESS: f32 = 11.0;
+pub const FLATNESS: f32 = 30.0;
 
 /// [`Kernel::Planar`]: the squared distance, in radii, from which weights begin to fall.
-pub const CORE: f32 = 0.2;
+pub const CORE: f32 = 0.5;
+
+/// [`Kernel::Planar`]: the squared distance, in radii, from which points count next to nothing: the
+/// floor beyond a wall that is as thick as that does not show on this side.
+pub const REACH: f32 = 1.2;
+
+/// [`Kernel::Planar`]: what is left of a point's weight beyond that, so that places without a point
+/// in reach have an answer too.
+pub const BEYOND: f32 = 0.001;
 
 /// [`Kernel::Planar`]: how far before the block switches the cells fade that it will leave, in
 /// cells.
 pub const FADE: f32 = 0.3;
 
-/// [`Kernel::Planar`]: points less open than this count less, in proportion.
+/// [`Kernel::Planar`]: points less open than this count less, by the square.
 pub const SEEN: f32 = 0.2;
 
 /// [`Kernel::Planar`]: what a point counts at least, however dark.
-pub const UNSEEN: f32 = 0.001;
+pub const UNSEEN: f32 = 0.0001;
 
 /// From this weight on, points that are not dark are near: what a baked value is for is not there
-/// any more. A point of [`Kernel::Planar`] at the fragment weighs 25, one at the radius 0.7.
-pub const NEAR: f32 = 0.5;
+/// any more. A point of [`Kernel::Planar`] at the fragment weighs 4, one at the radius 0.07.
+pub const NEAR: f32 = 0.05;
 
 /// How the points around a fragment are weighted.
 #[repr(u8)]
@@ -41,14 +49,15 @@ pub const NEAR: f32 = 0.5;
 pub enum Kernel {
     /// The paper's, Eq. 2 to 4; 1 where no point counts.
     Paper = 0,
-    /// s · (min(1, 5o) + 0.001) · max(0.1, n·nₚ)⁸ / (0.2 + (d² + 11h²)/r²)² with
-    /// h = max(|n·d|, |nₚ·d|); 1 where no point was fetched.
+    /// s · (min(1, 5o)² + 0.0001) · max(0.001, 1 − d²/1.2r²) · max(0.1, n·nₚ)⁸
+    /// / (0.5 + (d² + 30h²)/r²)² with h = max(|n·d|, |nₚ·d|); 1 where no point was fetched.
     ///
     /// s is the part of the point's cell: along each axis it falls to 0 over the last 0.3 cells
     /// before the block leaves the cell, so that the answer has no steps. A point of openness o
     /// below 0.2 counts less, as hardly any fragment nearby can see it: such points lie inside of
     /// solids or under what stands on their surface. Points that face elsewhere count next to
-    /// nothing, and so only where there is no other.
+    /// nothing, and so only where there is no other. So do points out of reach: what lies on the
+    /// other side of a wall does not show on a floor that goes on below it.
     #[default]
     Planar = 1,
 }
@@ -275,14 +284,17 @@ impl Weigh for Planar {
     fn weight(&self, d: Vec3, point_normal: Vec3, occlusion: f32) -> f32 {
         let agree = dot(point_normal, self.normal).max(T_N);
         let h = dot(self.normal, d).abs().max(dot(point_normal, d).abs());
-        let far = CORE + (dot(d, d) + FLATNESS * (h * h)) * self.inverse_radius_squared;
+        let squared = dot(d, d);
+        let far = CORE + (squared + FLATNESS * (h * h)) * self.inverse_radius_squared;
+        let in_reach = (1.0 - squared * self.inverse_radius_squared * (1.0 / REACH)).max(BEYOND);
         let agree2 = agree * agree;
         let agree4 = agree2 * agree2;
-        Self::seen(occlusion) * (agree4 * agree4) / (far * far)
+        Self::seen(occlusion) * in_reach * (agree4 * agree4) / (far * far)
     }
 
     fn seen(occlusion: f32) -> f32 {
-        (occlusion * (1.0 / (255.0 * SEEN))).min(1.0) + UNSEEN
+        let lit = (occlusion * (1.0 / (255.0 * SEEN))).min(1.0);
+        lit * lit + UNSEEN
     }
 }
 

@@ -84,10 +84,13 @@ fn psao_add_two(
     let along = psao_dot_two(normal, d);
     let point_along = psao_dot_each(d, point.normal);
     let h2 = max(along * along * point.square, point_along * point_along);
-    let near = fma(psao_dot_two(d, d), inverse_radius2, vec2<f32>(PSAO_CORE)) * point.square;
+    let squared = psao_dot_two(d, d);
+    let toward_reach = inverse_radius2 * (-1.0 / PSAO_REACH);
+    let in_reach = max(fma(squared, toward_reach, vec2<f32>(1.0)), vec2<f32>(PSAO_BEYOND));
+    let near = fma(squared, inverse_radius2, vec2<f32>(PSAO_CORE)) * point.square;
     let apart = fma(h2, PSAO_FLATNESS * inverse_radius2, near);
     let ratio = agree2 * agree2 / (apart * point.square);
-    let weight = share * point.seen * (ratio * ratio);
+    let weight = share * point.seen * in_reach * (ratio * ratio);
     return PsaoSums(
         sums.weights + weight,
         fma(weight, vec2<f32>(point.openness), sums.openness),

@@ -87,12 +87,14 @@ struct PsaoPoint {
 
 static const float PSAO_T_N = 0.1;
 static const float PSAO_T_D = 0.7;
-static const float PSAO_FLATNESS = 11.0;
-static const float PSAO_CORE = 0.2;
+static const float PSAO_FLATNESS = 30.0;
+static const float PSAO_CORE = 0.5;
+static const float PSAO_REACH = 1.2;
+static const float PSAO_BEYOND = 0.001;
 static const float PSAO_FADE = 0.3;
 static const float PSAO_SEEN = 0.2;
-static const float PSAO_UNSEEN = 0.001;
-static const float PSAO_NEAR = 0.5;
+static const float PSAO_UNSEEN = 0.0001;
+static const float PSAO_NEAR = 0.05;
 static const uint PSAO_PAPER = 0u;
 static const uint PSAO_ENTRY_CELL = 4194303u;
 
@@ -279,10 +281,12 @@ float psao_planar_weight(float radius_1, float3 normal_3, float3 d_1, float3 poi
 {
     float agree = max(dot(point_normal_1, normal_3), PSAO_T_N);
     float h = max(abs(dot(normal_3, d_1)), abs(dot(point_normal_1, d_1)));
-    float apart = (PSAO_CORE + ((dot(d_1, d_1) + (PSAO_FLATNESS * (h * h))) / (radius_1 * radius_1)));
+    float squared_2 = dot(d_1, d_1);
+    float apart = (PSAO_CORE + ((squared_2 + (PSAO_FLATNESS * (h * h))) / (radius_1 * radius_1)));
+    float in_reach = max((1.0 - (squared_2 / ((PSAO_REACH * radius_1) * radius_1))), PSAO_BEYOND);
     float agree2_ = (agree * agree);
     float agree4_ = (agree2_ * agree2_);
-    return ((agree4_ * agree4_) / (apart * apart));
+    return (((in_reach * agree4_) * agree4_) / (apart * apart));
 }
 
 float psao_side(float3 place, uint3 offset)
@@ -294,7 +298,8 @@ float psao_side(float3 place, uint3 offset)
 
 float psao_seen(float openness)
 {
-    return (min((openness / PSAO_SEEN), 1.0) + PSAO_UNSEEN);
+    float lit_ = min((openness / PSAO_SEEN), 1.0);
+    return ((lit_ * lit_) + PSAO_UNSEEN);
 }
 
 float2 psao_blend(bool planar, uint instance_2, float3 position_2, float3 normal_4)
@@ -669,7 +674,8 @@ PsaoPoint psao_point(uint point_3)
     float fold = max(-(z_1), 0.0);
     float3 m = float3((uv_1 - ((uv_1 < (0.0).xx) ? (-(fold)).xx : (fold).xx)), z_1);
     float openness_2 = float(int((point_3 & 255u)));
-    float seen_1 = (min((openness_2 * 0.019607844), 1.0) + PSAO_UNSEEN);
+    float lit_1 = min((openness_2 * 0.019607844), 1.0);
+    float seen_1 = mad(lit_1, lit_1, PSAO_UNSEEN);
     const PsaoPoint psaopoint = ConstructPsaoPoint((float3(steps_1) * scale), m, mad(m.x, m.x, mad(m.y, m.y, (m.z * m.z))), openness_2, ((int(point_3) >= int(0)) ? 0.0 : seen_1));
     return psaopoint;
 }
@@ -690,10 +696,11 @@ float2 psao_add(float2 sums, float inverse_radius2_, float3 normal_7, float3 pla
     const float _e20 = psao_dot(_e6.normal, d_3);
     float h2_ = max(((_e18 * _e18) * _e6.square), (_e20 * _e20));
     const float _e26 = psao_dot(d_3, d_3);
+    float in_reach_1 = max(mad(_e26, (inverse_radius2_ * -0.8333333), 1.0), PSAO_BEYOND);
     float near = (mad(_e26, inverse_radius2_, PSAO_CORE) * _e6.square);
     float apart_1 = mad(h2_, (PSAO_FLATNESS * inverse_radius2_), near);
     float ratio = ((agree2_1 * agree2_1) / (apart_1 * _e6.square));
-    float weight_1 = ((share * _e6.seen) * (ratio * ratio));
+    float weight_1 = (((share * _e6.seen) * in_reach_1) * (ratio * ratio));
     return mad((weight_1).xx, float2(1.0, _e6.openness), sums);
 }
 

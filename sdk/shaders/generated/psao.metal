@@ -82,12 +82,14 @@ struct PsaoPoint {
 };
 constant float PSAO_T_N = 0.1;
 constant float PSAO_T_D = 0.7;
-constant float PSAO_FLATNESS = 11.0;
-constant float PSAO_CORE = 0.2;
+constant float PSAO_FLATNESS = 30.0;
+constant float PSAO_CORE = 0.5;
+constant float PSAO_REACH = 1.2;
+constant float PSAO_BEYOND = 0.001;
 constant float PSAO_FADE = 0.3;
 constant float PSAO_SEEN = 0.2;
-constant float PSAO_UNSEEN = 0.001;
-constant float PSAO_NEAR = 0.5;
+constant float PSAO_UNSEEN = 0.0001;
+constant float PSAO_NEAR = 0.05;
 constant uint PSAO_PAPER = 0u;
 constant uint PSAO_ENTRY_CELL = 4194303u;
 
@@ -278,10 +280,12 @@ float psao_planar_weight(
 ) {
     float agree = metal::max(metal::dot(point_normal_1, normal_3), PSAO_T_N);
     float h = metal::max(metal::abs(metal::dot(normal_3, d_1)), metal::abs(metal::dot(point_normal_1, d_1)));
-    float apart = PSAO_CORE + ((metal::dot(d_1, d_1) + (PSAO_FLATNESS * (h * h))) / (radius_1 * radius_1));
+    float squared_2 = metal::dot(d_1, d_1);
+    float apart = PSAO_CORE + ((squared_2 + (PSAO_FLATNESS * (h * h))) / (radius_1 * radius_1));
+    float in_reach = metal::max(1.0 - (squared_2 / ((PSAO_REACH * radius_1) * radius_1)), PSAO_BEYOND);
     float agree2_ = agree * agree;
     float agree4_ = agree2_ * agree2_;
-    return (agree4_ * agree4_) / (apart * apart);
+    return ((in_reach * agree4_) * agree4_) / (apart * apart);
 }
 
 float psao_side(
@@ -296,7 +300,8 @@ float psao_side(
 float psao_seen(
     float openness
 ) {
-    return metal::min(openness / PSAO_SEEN, 1.0) + PSAO_UNSEEN;
+    float lit = metal::min(openness / PSAO_SEEN, 1.0);
+    return (lit * lit) + PSAO_UNSEEN;
 }
 
 metal::float2 psao_blend(
@@ -667,7 +672,8 @@ PsaoPoint psao_point(
     float fold = metal::max(-(z_1), 0.0);
     metal::float3 m = metal::float3(uv_1 - metal::select(metal::float2(fold), metal::float2(-(fold)), uv_1 < metal::float2(0.0)), z_1);
     float openness_2 = static_cast<float>(static_cast<int>(point_3 & 255u));
-    float seen_1 = metal::min(openness_2 * 0.019607844, 1.0) + PSAO_UNSEEN;
+    float lit_1 = metal::min(openness_2 * 0.019607844, 1.0);
+    float seen_1 = metal::fma(lit_1, lit_1, PSAO_UNSEEN);
     return PsaoPoint {static_cast<metal::float3>(steps_1) * scale, m, metal::fma(m.x, m.x, metal::fma(m.y, m.y, m.z * m.z)), openness_2, (static_cast<int>(point_3) >= 0) ? 0.0 : seen_1};
 }
 
@@ -695,10 +701,11 @@ metal::float2 psao_add(
     float _e20 = psao_dot(_e6.normal, d_3);
     float h2_ = metal::max((_e18 * _e18) * _e6.square, _e20 * _e20);
     float _e26 = psao_dot(d_3, d_3);
+    float in_reach_1 = metal::max(metal::fma(_e26, inverse_radius2_ * -0.8333333, 1.0), PSAO_BEYOND);
     float near = metal::fma(_e26, inverse_radius2_, PSAO_CORE) * _e6.square;
     float apart_1 = metal::fma(h2_, PSAO_FLATNESS * inverse_radius2_, near);
     float ratio = (agree2_1 * agree2_1) / (apart_1 * _e6.square);
-    float weight_1 = (share * _e6.seen) * (ratio * ratio);
+    float weight_1 = ((share * _e6.seen) * in_reach_1) * (ratio * ratio);
     return metal::fma(metal::float2(weight_1), metal::float2(1.0, _e6.openness), sums);
 }
 

@@ -75,12 +75,14 @@ struct PsaoPoint {
 };
 const float PSAO_T_N = 0.1;
 const float PSAO_T_D = 0.7;
-const float PSAO_FLATNESS = 11.0;
-const float PSAO_CORE = 0.2;
+const float PSAO_FLATNESS = 30.0;
+const float PSAO_CORE = 0.5;
+const float PSAO_REACH = 1.2;
+const float PSAO_BEYOND = 0.001;
 const float PSAO_FADE = 0.3;
 const float PSAO_SEEN = 0.2;
-const float PSAO_UNSEEN = 0.001;
-const float PSAO_NEAR = 0.5;
+const float PSAO_UNSEEN = 0.0001;
+const float PSAO_NEAR = 0.05;
 const uint PSAO_PAPER = 0u;
 const uint PSAO_ENTRY_CELL = 4194303u;
 
@@ -229,10 +231,12 @@ float psao_paper_weight(float radius, vec3 normal_2, vec3 d, vec3 point_normal) 
 float psao_planar_weight(float radius_1, vec3 normal_3, vec3 d_1, vec3 point_normal_1) {
     float agree = max(dot(point_normal_1, normal_3), PSAO_T_N);
     float h = max(abs(dot(normal_3, d_1)), abs(dot(point_normal_1, d_1)));
-    float apart = (PSAO_CORE + ((dot(d_1, d_1) + (PSAO_FLATNESS * (h * h))) / (radius_1 * radius_1)));
+    float squared_2 = dot(d_1, d_1);
+    float apart = (PSAO_CORE + ((squared_2 + (PSAO_FLATNESS * (h * h))) / (radius_1 * radius_1)));
+    float in_reach = max((1.0 - (squared_2 / ((PSAO_REACH * radius_1) * radius_1))), PSAO_BEYOND);
     float agree2_ = (agree * agree);
     float agree4_ = (agree2_ * agree2_);
-    return ((agree4_ * agree4_) / (apart * apart));
+    return (((in_reach * agree4_) * agree4_) / (apart * apart));
 }
 
 float psao_side(vec3 place, uvec3 offset) {
@@ -242,7 +246,8 @@ float psao_side(vec3 place, uvec3 offset) {
 }
 
 float psao_seen(float openness) {
-    return (min((openness / PSAO_SEEN), 1.0) + PSAO_UNSEEN);
+    float lit = min((openness / PSAO_SEEN), 1.0);
+    return ((lit * lit) + PSAO_UNSEEN);
 }
 
 vec2 psao_blend(bool planar, uint instance_2, vec3 position_2, vec3 normal_4) {
@@ -528,7 +533,8 @@ PsaoPoint psao_point(uint point_3) {
     float fold = max(-(z_1), 0.0);
     vec3 m = vec3((uv_1 - mix(vec2(fold), vec2(-(fold)), lessThan(uv_1, vec2(0.0)))), z_1);
     float openness_2 = float(int((point_3 & 255u)));
-    float seen_1 = (min((openness_2 * 0.019607844), 1.0) + PSAO_UNSEEN);
+    float lit_1 = min((openness_2 * 0.019607844), 1.0);
+    float seen_1 = (lit_1 * lit_1 + PSAO_UNSEEN);
     return PsaoPoint((vec3(steps_1) * scale), m, (m.x * m.x + (m.y * m.y + (m.z * m.z))), openness_2, ((int(point_3) >= 0) ? 0.0 : seen_1));
 }
 
@@ -546,10 +552,11 @@ vec2 psao_add(vec2 sums, float inverse_radius2_, vec3 normal_7, vec3 place_2, fl
     float _e20 = psao_dot(_e6.normal, d_3);
     float h2_ = max(((_e18 * _e18) * _e6.square), (_e20 * _e20));
     float _e26 = psao_dot(d_3, d_3);
+    float in_reach_1 = max((_e26 * (inverse_radius2_ * -0.8333333) + 1.0), PSAO_BEYOND);
     float near = ((_e26 * inverse_radius2_ + PSAO_CORE) * _e6.square);
     float apart_1 = (h2_ * (PSAO_FLATNESS * inverse_radius2_) + near);
     float ratio = ((agree2_1 * agree2_1) / (apart_1 * _e6.square));
-    float weight_1 = ((share * _e6.seen) * (ratio * ratio));
+    float weight_1 = (((share * _e6.seen) * in_reach_1) * (ratio * ratio));
     return (vec2(weight_1) * vec2(1.0, _e6.openness) + sums);
 }
 

@@ -3,7 +3,7 @@
 
 use crate::truth::{Placement, buckets_for, choose_buckets, fit};
 use glam::Vec3;
-use psao_core::lookup::{CORE, FADE, FLATNESS, SEEN, T_D, T_N, UNSEEN};
+use psao_core::lookup::{BEYOND, CORE, FADE, FLATNESS, REACH, SEEN, T_D, T_N, UNSEEN};
 use psao_core::point::{NORMALS, decode_position};
 use psao_core::{Bucket, Instance, Point};
 use rayon::prelude::*;
@@ -393,14 +393,15 @@ impl<const FADES: bool, const HIDES: bool> Formula for Planar<FADES, HIDES> {
         let agree = point_normal.dot(self.normal).max(T_N);
         let h = self.normal.dot(d).abs().max(point_normal.dot(d).abs());
         let far = CORE + (squared + FLATNESS * (h * h)) * self.inverse_radius_squared;
+        let in_reach = (1.0 - squared * self.inverse_radius_squared * (1.0 / REACH)).max(BEYOND);
         let seen = if HIDES {
-            (openness * (1.0 / SEEN)).min(1.0) + UNSEEN
+            (openness * (1.0 / SEEN)).min(1.0).powi(2) + UNSEEN
         } else {
             1.0
         };
         let agree2 = agree * agree;
         let agree4 = agree2 * agree2;
-        self.side * seen * agree4 * agree4 / (far * far)
+        self.side * seen * in_reach * agree4 * agree4 / (far * far)
     }
 }
 
