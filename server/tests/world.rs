@@ -6,8 +6,11 @@ mod small_scene;
 use glam::{DAffine3, DVec3, Vec3};
 use psao_core::residual::{BLOCK, Quantiser};
 use psao_core::{Bucket, Cell, Kernel};
-use psao_server::encode::{Compression, Encoder, Limits, Scheme, View};
+use psao_server::args::camera_path;
+use psao_server::camera::Frustum;
+use psao_server::encode::{Compression, Encoder, Eye, Limits, Scheme, View};
 use psao_server::points::PointError;
+use psao_server::rays::Against;
 use psao_server::scene::Scene;
 use psao_server::world::{Options, World, WorldError};
 use small_scene::{FLOOR, MOVER, POST, SHEET, STILL, small_scene, still_scene};
@@ -625,6 +628,50 @@ fn a_density_that_asks_for_too_much_is_refused_before_memory_is_taken() {
     many.instances.resize(9, floor);
     let error = refused(many, 1.5e6);
     assert!(matches!(error, WorldError::TooManyPoints(_)), "{error}");
+}
+
+#[test]
+fn a_new_view_is_all_but_whole_in_its_first_frame() {
+    let options = laid_out(options(768.0, 16), residual());
+    let mut world = world(Scene::atrium(), options);
+    let path = camera_path(&world, 1, 1.6).unwrap();
+    world.step(0.0, &all, u64::MAX);
+    let mut encoder = Encoder::new(&world, residual(), 0);
+    encoder.header(&world, 1, 60.0);
+    // The second is a cut to another place.
+    for time in [0.0, 20.0] {
+        let camera = path.at(time);
+        let frustum = Frustum::new(&camera, 0.2);
+        let view = View {
+            sees: &|[min, max]| frustum.sees_box(min, max),
+            eye: Some(Eye::of(&camera, 360)),
+        };
+        encoder.frame(&world, 0, &view, true, &mut Vec::new());
+        let has = encoder.slices().unwrap().get();
+        let (mut seen, mut missing, mut left) = (0, 0, 0);
+        for (slice, has) in world.slices.iter().zip(has) {
+            for number in slice.points.clone().step_by(9) {
+                let [at, normal] = world.point_in_world(slice.instance, number);
+                let (way, far) = (camera.position - at).normalize_and_length();
+                let clear = || {
+                    let (origin, mut hit) = (at + normal * 1e-3, [0]);
+                    let tracer = world.tracer();
+                    tracer.occluded(Against::All, origin, &[way], far, &[1], &mut hit);
+                    hit == [0]
+                };
+                let shows =
+                    view.needs(&world, slice.instance, number) && way.dot(normal) > 0.0 && clear();
+                seen += usize::from(shows);
+                missing += usize::from(shows && has.point_count == 0);
+            }
+            left += usize::from((view.sees)(slice.bounds) && has.point_count == 0);
+        }
+        assert!(
+            missing * 100 < seen,
+            "{missing} of {seen} points, at {time} s"
+        );
+        assert!(left > 0, "nothing is behind anything at {time} s");
+    }
 }
 
 #[test]

@@ -4,6 +4,7 @@ use super::{Eye, View};
 use crate::render::{Fragment, first_visible};
 use crate::world::World;
 use rayon::prelude::*;
+use std::ops::RangeBounds;
 
 /// Points of a slice that are looked for from the camera, each time that it is its turn; and after
 /// how many without one in sight it is no longer new. What is behind walls so waits, and what is
@@ -13,7 +14,8 @@ const NEW_LOOKS: u8 = 64;
 
 /// Rays that a frame spends so on slices that came into the frustum a short while ago, and on the
 /// others: however many there are, all have their turn. (A slice is the smaller the denser points
-/// are: as many rays then find as much.)
+/// are: as many rays then find as much.) What has come with this very frame is looked for at once,
+/// all of it, so that a new view is whole in its first frame.
 const NEW_RAYS: usize = 4096;
 const RAYS: usize = 1024;
 
@@ -21,6 +23,10 @@ const RAYS: usize = 1024;
 /// have not been in sight: what shows between two columns is found the sooner the more of the
 /// picture it fills.
 const PICTURE_LOOKS: [u32; 2] = [24, 14];
+
+/// So many times as many, across and down, where more has come with the frame than
+/// [`NEW_RAYS`] look for.
+const NEW_PICTURE: u32 = 6;
 
 /// What has been in a client's view so far.
 pub struct Sight {
@@ -54,9 +60,6 @@ impl Sight {
     pub fn look(&mut self, world: &World, view: &View<'_>) {
         self.frames += 1;
         let frames = self.frames;
-        if let (Some(eye), false) = (&view.eye, self.hidden.is_empty()) {
-            self.look_through_picture(world, eye);
-        }
         let marks = self.seen.par_iter_mut().zip(&mut self.looked);
         let slices = world.slices.par_iter().zip(marks);
         slices.for_each(|(slice, (seen, looked))| {
@@ -73,6 +76,9 @@ impl Sight {
                 self.hidden.push(index as u32);
             }
         }
+        if let (Some(eye), false) = (&view.eye, self.hidden.is_empty()) {
+            self.look_through_picture(world, eye);
+        }
         self.find(world, view);
         let seen = self.seen.iter().zip(&self.sighted).zip(0..);
         let needed = seen.filter(|((seen, sighted), _)| **seen == frames && **sighted);
@@ -88,14 +94,20 @@ impl Sight {
             }
             return;
         };
-        let is_new = |slice: u32| self.looked[slice as usize] < NEW_LOOKS;
-        let new = self.hidden.iter().filter(|slice| is_new(**slice)).count();
+        let (new, others) = (
+            self.hidden_after(1..NEW_LOOKS),
+            self.hidden_after(NEW_LOOKS..),
+        );
         // One in so many has its turn.
         let new_turn = (new * LOOKS).div_ceil(NEW_RAYS) as u64;
-        let turn = ((self.hidden.len() - new) * LOOKS).div_ceil(RAYS) as u64;
+        let turn = (others * LOOKS).div_ceil(RAYS) as u64;
         let frames = self.frames;
         let looked_for = |slice: u32| {
-            let turn = if is_new(slice) { new_turn } else { turn };
+            let turn = match self.looked[slice as usize] {
+                0 => 1,
+                1..NEW_LOOKS => new_turn,
+                _ => turn,
+            };
             (frames + u64::from(slice)).is_multiple_of(turn)
         };
         let found = |&slice: &u32| {
@@ -103,9 +115,10 @@ impl Sight {
             let (slice, from) = (&world.slices[slice as usize], eye.camera.position);
             world.is_seen(slice, from, LOOKS as u32, seed)
         };
-        let turns = self.hidden.par_iter().copied();
-        let turns = turns.filter(|slice| looked_for(*slice));
-        let found: Vec<(u32, bool)> = turns.map(|slice| (slice, found(&slice))).collect();
+        let turns = self.hidden.iter().copied();
+        let turns: Vec<u32> = turns.filter(|slice| looked_for(*slice)).collect();
+        let turns = turns.par_iter();
+        let found: Vec<(u32, bool)> = turns.map(|slice| (*slice, found(slice))).collect();
         for (slice, found) in found {
             let looked = &mut self.looked[slice as usize];
             *looked = looked.saturating_add(LOOKS as u8);
@@ -113,9 +126,17 @@ impl Sight {
         }
     }
 
+    /// How many slices in the frustum have not been in sight after so many looks.
+    fn hidden_after(&self, looks: impl RangeBounds<u8>) -> usize {
+        let looked = self.hidden.iter().map(|slice| self.looked[*slice as usize]);
+        looked.filter(|looked| looks.contains(looked)).count()
+    }
+
     /// Marks slices that the picture shows.
     fn look_through_picture(&mut self, world: &World, eye: &Eye) {
-        let [width, height] = PICTURE_LOOKS;
+        let much = self.hidden_after(..1) * LOOKS > NEW_RAYS;
+        let finer = if much { NEW_PICTURE } else { 1 };
+        let [width, height] = PICTURE_LOOKS.map(|looks| looks * finer);
         let frame = self.frames as u32;
         let shown: Vec<u32> = (0..width * height)
             .into_par_iter()
@@ -137,6 +158,8 @@ impl Sight {
         for slice in shown {
             self.sighted[slice as usize] = true;
         }
+        let sighted = &self.sighted;
+        self.hidden.retain(|slice| !sighted[*slice as usize]);
     }
 
     /// Frames so far, and 1.
