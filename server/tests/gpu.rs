@@ -597,7 +597,7 @@ fn the_race_checks_and_times_every_method_and_keeps_its_pictures() {
     let why = race.no_ray_query.expect("nobody asked for ray queries");
     assert!(
         race.table()
-            .contains(&format!("| 1 ray a pixel, ray query      | {why}"))
+            .contains(&format!("| 1 ray a pixel, ray query    | {why}"))
     );
     let of = |name: &str| {
         race.rows
@@ -606,7 +606,7 @@ fn the_race_checks_and_times_every_method_and_keeps_its_pictures() {
             .expect("a method")
     };
     // The fast lookup against both exact ones: the smaller of the two ratios is told.
-    let exact = ["lookup, exact", "lookup, exact, paper's kernel"].map(|name| of(name).over_fast);
+    let exact = ["lookup, exact", "lookup, exact, paper kernel"].map(|name| of(name).over_fast);
     let told = format!("at least {:.2} times fewer ms", exact[0].min(exact[1]));
     assert!(race.table().contains(&told), "{told}");
     // Noise, and the same without some of it.
