@@ -382,9 +382,10 @@ fn fast_is_exact_to_the_eye() {
     }
 }
 
-/// Prints what both tiers take, and the lookup of the paper; see docs/gpu.md.
+/// Prints what both tiers take, and the lookup of the paper; docs/gpu.md tells how near the ratios
+/// come to 3 where nothing else runs. Here other tests may, so this asks for a little less.
 #[test]
-fn fast_takes_fewer_milliseconds_than_exact() {
+fn fast_takes_fewer_milliseconds_than_either_exact_kernel() {
     let gpu = Gpu::new(wgpu::Features::TIMESTAMP_QUERY);
     let set = gpu.device.create_query_set(&wgpu::QuerySetDescriptor {
         label: None,
@@ -407,7 +408,7 @@ fn fast_takes_fewer_milliseconds_than_exact() {
         .map(|(kernel, tier)| Pass::new(&gpu.device, &buffers, kernel, tier));
         let mut ms = [const { Vec::new() }; 3];
         // In turn, so that what else runs on the machine slows all of them.
-        for _ in 0..7 {
+        for _ in 0..15 {
             for (pass, ms) in passes.iter().zip(&mut ms) {
                 let writes = wgpu::ComputePassTimestampWrites {
                     query_set: &set,
@@ -423,17 +424,22 @@ fn fast_takes_fewer_milliseconds_than_exact() {
                 ms.push((ticks[1] - ticks[0]) as f32 * period_ns / 1e6);
             }
         }
-        let [exact, fast, paper] = ms.map(|mut ms| {
-            ms.sort_by(f32::total_cmp);
-            ms[ms.len() / 2]
-        });
+        // The least of them: all else that runs only adds.
+        let [exact, fast, paper] = ms.map(|ms| ms.into_iter().fold(f32::INFINITY, f32::min));
         println!(
-            "{}, {WIDTH}x{HEIGHT}: planar exact {exact:.1} ms, fast {fast:.1} ms ({:.2} times \
-             fewer), paper exact {paper:.1} ms",
+            "{}, {WIDTH}x{HEIGHT}: fast {fast:.1} ms, exact planar {exact:.1} ({:.2} times as \
+             many), exact paper {paper:.1} ({:.2})",
             shot.name,
-            exact / fast
+            exact / fast,
+            paper / fast
         );
-        assert!(fast < 0.5 * exact, "fast takes {fast} ms, exact {exact} ms");
+        for (kernel, ms) in [("planar", exact), ("paper", paper)] {
+            assert!(
+                fast < 0.4 * ms,
+                "{}: fast takes {fast} ms, exact {kernel} {ms} ms",
+                shot.name
+            );
+        }
     }
 }
 

@@ -265,19 +265,24 @@ fn psao_paper(instance: u32, position: vec3<f32>, normal: vec3<f32>) -> f32 {
 
 // The tag of a key where a bucket's entry has it, above the cell's index; never 0. Whoever uploads
 // buckets may put it there: it tells a cell that is not there without a look at the cells that are.
-// No two entries of a bucket have the same tag: such a bucket is left without any.
+// No two entries of a bucket have the same tag, and none is in its second half: other buckets are
+// left without any.
 fn psao_tag(key: u32) -> u32 {
     return max((key * 0x9e3779b1u) & ~PSAO_ENTRY_CELL, PSAO_ENTRY_CELL + 1u);
 }
 
-// hash % count, for a count below 2^23; inverse is 1 / count. Integer division is slow on GPUs.
+// hash % count, for a count below 2^23; inverse is 1 / count. Integer division is slow on GPUs, and
+// unsigned integers are where they become floats or are compared.
 fn psao_modulo(hash: u32, count: u32, inverse: f32) -> u32 {
     // Floats hold 24 bits: a quotient that is surely not too large, then one for what it left.
-    let left = hash - u32(f32(hash) * inverse * 0.999999) * count;
-    let rest = left - u32(f32(left) * inverse) * count;
-    // One count too few or too many: what is below 0 has wrapped to a large number.
-    let raised = select(rest, rest + count, rest >= 0x80000000u);
-    return select(raised, raised - count, raised >= count);
+    let left = i32(hash - u32(i32(f32(i32(hash >> 1u)) * (inverse * 1.999998))) * count);
+    let divisor = i32(count);
+    let rest = left - i32(f32(left) * inverse) * divisor;
+    // One count too few or too many.
+    let raised = select(rest, rest + divisor, rest < 0);
+    let whole = select(raised, raised - divisor, raised >= divisor);
+    // The first quotient by 1 is no signed integer.
+    return select(u32(whole), 0u, count == 1u);
 }
 
 // Which bit is the lowest: the exponent of that bit as a float. GLSL ES 3.00 cannot say.
@@ -356,8 +361,8 @@ fn psao_candidate(there: bool, key: u32, bucket: u32) -> PsaoCandidate {
     let entries = psao_load_bucket(bucket * 2u);
     let found = psao_pick(entries, psao_tag(key));
     let here = found <= PSAO_ENTRY_CELL;
-    // One bucket of a hundred has a second half, one of some hundred no tags.
-    let unsure = (!here && entries.w != 0u) || entries.x - 1u < PSAO_ENTRY_CELL;
+    // One bucket of some hundred has no tags and has to be searched.
+    let unsure = entries.x - 1u < PSAO_ENTRY_CELL;
     return PsaoCandidate(select(0u, found, here), select(0u, 1u, unsure));
 }
 
@@ -389,14 +394,22 @@ struct PsaoBlock {
     unsure: u32,
 }
 
-fn psao_block(grid: PsaoGrid, table: PsaoTable, base: vec3<u32>, live: bool) -> PsaoBlock {
-    let low = (base < grid.dims) & vec3<bool>(live);
-    let high = (base + 1u < grid.dims) & vec3<bool>(live);
-    let x = vec2<bool>(low.x, high.x);
-    let a = psao_pair(table, x & vec2<bool>(low.y && low.z), vec2<u32>(0u, 0u));
-    let b = psao_pair(table, x & vec2<bool>(high.y && low.z), vec2<u32>(1u, 0u));
-    let c = psao_pair(table, x & vec2<bool>(low.y && high.z), vec2<u32>(0u, 1u));
-    let d = psao_pair(table, x & vec2<bool>(high.y && high.z), vec2<u32>(1u, 1u));
+// Bits: the corners of a block that lie inside of the grid.
+fn psao_within(grid: PsaoGrid, base: vec3<u32>) -> u32 {
+    let low = vec3<u32>(base < grid.dims) * vec3<u32>(0x55u, 0x33u, 0x0fu);
+    let high = vec3<u32>(base + 1u < grid.dims) * vec3<u32>(0xaau, 0xccu, 0xf0u);
+    let axes = low | high;
+    return axes.x & axes.y & axes.z;
+}
+
+// The cells at some corners of a block.
+fn psao_block(table: PsaoTable, corners: u32) -> PsaoBlock {
+    let low = (vec4<u32>(corners) & vec4<u32>(1u, 2u, 4u, 8u)) != vec4<u32>(0u);
+    let high = (vec4<u32>(corners) & vec4<u32>(16u, 32u, 64u, 128u)) != vec4<u32>(0u);
+    let a = psao_pair(table, low.xy, vec2<u32>(0u, 0u));
+    let b = psao_pair(table, low.zw, vec2<u32>(1u, 0u));
+    let c = psao_pair(table, high.xy, vec2<u32>(0u, 1u));
+    let d = psao_pair(table, high.zw, vec2<u32>(1u, 1u));
     return PsaoBlock(
         vec4<u32>(a.cells, b.cells),
         vec4<u32>(c.cells, d.cells),
@@ -435,6 +448,23 @@ fn psao_cell_at(block: PsaoBlock, offset: vec3<u32>) -> u32 {
     return select(lower, upper, offset.z != 0u);
 }
 
+// A look at one entry of a bucket without tags.
+struct PsaoPeek {
+    // The cell with the key, 0 if it is not in this entry.
+    cell: u32,
+    // No other entry needs a look.
+    last: bool,
+}
+
+fn psao_peek(wanted: bool, bucket: u32, key: u32, entry: u32) -> PsaoPeek {
+    if !wanted {
+        return PsaoPeek(0u, true);
+    }
+    let cell = psao_load_bucket(bucket * 2u + (entry >> 2u))[entry & 3u] & PSAO_ENTRY_CELL;
+    let here = cell != 0u && psao_load_cell(cell * 2u).x == key;
+    return PsaoPeek(select(0u, cell, here), here || cell == 0u || entry == 7u);
+}
+
 // Up to three points of a cell; 0 where there is none. The third round is for the seventh point.
 struct PsaoRound {
     points: vec3<u32>,
@@ -452,9 +482,14 @@ fn psao_round(cell: u32, key: u32, round: u32) -> PsaoRound {
     return PsaoRound(vec3<u32>(a, b, c), c != 0u);
 }
 
-// How much a cell counts for a fragment at this place in it.
+// Half a step of a point's place: it is in the middle of its step.
+const PSAO_HALF_STEP: f32 = 0.015625;
+
+// How much a cell counts for a fragment at this place in it, half a step less.
 fn psao_share(place: vec3<f32>) -> f32 {
-    let sides = clamp((1.0 - abs(place - 0.5)) / PSAO_FADE, vec3<f32>(0.0), vec3<f32>(1.0));
+    // Times the inverse: not every compiler makes this of a division by a constant.
+    let inside = 1.0 - abs(place - (0.5 - PSAO_HALF_STEP));
+    let sides = clamp(inside * (1.0 / PSAO_FADE), vec3<f32>(0.0), vec3<f32>(1.0));
     return sides.x * sides.y * sides.z;
 }
 
@@ -492,35 +527,65 @@ fn psao_point(point: u32) -> PsaoPoint {
     );
 }
 
-fn psao_dot(a: vec3<f32>, b: vec3<f32>) -> f32 {
+// Three coordinates of two fragments.
+struct PsaoTwo {
+    x: vec2<f32>,
+    y: vec2<f32>,
+    z: vec2<f32>,
+}
+
+fn psao_two(a: vec3<f32>, b: vec3<f32>) -> PsaoTwo {
+    return PsaoTwo(vec2<f32>(a.x, b.x), vec2<f32>(a.y, b.y), vec2<f32>(a.z, b.z));
+}
+
+fn psao_dot_two(a: PsaoTwo, b: PsaoTwo) -> vec2<f32> {
     return fma(a.x, b.x, fma(a.y, b.y, a.z * b.z));
 }
 
-// A blend that is being made, with one more point: the sum of the weights, and of the weighted
-// openness in 1/255. `place` is the fragment's in the cell, half a step less; `share` the cell's
-// part. The formula of psao_planar_weight, with one division.
-fn psao_add(
-    sums: vec2<f32>,
-    inverse_radius2: f32,
-    normal: vec3<f32>,
-    place: vec3<f32>,
-    share: f32,
-    word: u32,
-) -> vec2<f32> {
+fn psao_dot_each(a: PsaoTwo, b: vec3<f32>) -> vec2<f32> {
+    return fma(a.x, vec2<f32>(b.x), fma(a.y, vec2<f32>(b.y), a.z * b.z));
+}
+
+// Two fragments' blends that are being made: sums of the weights, and of the weighted openness in
+// 1/255.
+struct PsaoSums {
+    weights: vec2<f32>,
+    openness: vec2<f32>,
+}
+
+// Two fragments among the points of a cell.
+struct PsaoSeen {
+    // Unit length.
+    normal: PsaoTwo,
+    // In the cell, half a step less.
+    place: PsaoTwo,
+    inverse_radius2: vec2<f32>,
+    // How much the cell counts.
+    share: vec2<f32>,
+}
+
+// With one more point. The formula of psao_planar_weight, with one division. Where there is just
+// one fragment, compilers leave out what is done for the other.
+fn psao_add(sums: PsaoSums, seen: PsaoSeen, word: u32) -> PsaoSums {
     let point = psao_point(word);
-    let d = point.place - place;
-    let agree = max(psao_dot(point.normal, normal), 0.0);
-    let agree2 = max(agree * agree, (PSAO_T_N * PSAO_T_N) * point.square);
-    let along = psao_dot(normal, d);
-    let point_along = psao_dot(point.normal, d);
+    let p = point.place;
+    let d = PsaoTwo(p.x - seen.place.x, p.y - seen.place.y, p.z - seen.place.z);
+    let agree = max(psao_dot_each(seen.normal, point.normal), vec2<f32>(0.0));
+    let agree2 = max(agree * agree, vec2<f32>((PSAO_T_N * PSAO_T_N) * point.square));
+    let along = psao_dot_two(seen.normal, d);
+    let point_along = psao_dot_each(d, point.normal);
     let h2 = max(along * along * point.square, point_along * point_along);
-    let squared = psao_dot(d, d);
-    let in_reach = max(fma(squared, inverse_radius2 * (-1.0 / PSAO_REACH), 1.0), PSAO_BEYOND);
-    let near = fma(squared, inverse_radius2, PSAO_CORE) * point.square;
-    let apart = fma(h2, PSAO_FLATNESS * inverse_radius2, near);
-    let ratio = agree2 * agree2 / (apart * point.square);
-    let weight = share * point.seen * in_reach * (ratio * ratio);
-    return fma(vec2<f32>(weight), vec2<f32>(1.0, point.openness), sums);
+    let squared = psao_dot_two(d, d);
+    let to_reach = seen.inverse_radius2 * (-1.0 / PSAO_REACH);
+    let in_reach = max(fma(squared, to_reach, vec2<f32>(1.0)), vec2<f32>(PSAO_BEYOND));
+    let near = fma(squared, seen.inverse_radius2, vec2<f32>(PSAO_CORE)) * point.square;
+    let apart = fma(h2, PSAO_FLATNESS * seen.inverse_radius2, near) * point.square;
+    let ratio = agree2 * agree2 / apart;
+    let weight = seen.share * point.seen * in_reach * (ratio * ratio);
+    return PsaoSums(
+        sums.weights + weight,
+        fma(weight, vec2<f32>(point.openness), sums.openness),
+    );
 }
 
 // What psao_blend gives.
@@ -531,36 +596,51 @@ fn psao_blend_fast(instance: u32, position: vec3<f32>, normal: vec3<f32>) -> vec
         return vec2<f32>(1.0, 0.0);
     }
     // First all cells that may be there, then their points: fragments side by side spend as many
-    // rounds as they have cells, and not always eight.
+    // rounds as they have cells, and not always eight. Loops end at their end: some GPUs run a body
+    // once more only to find that there is nothing to do.
     let base = vec3<u32>(fragment.base);
     let table = psao_table(grid, base);
-    var block = psao_block(grid, table, base, true);
-    while block.unsure != 0u {
+    var block = psao_block(table, psao_within(grid, base));
+    var entry = 0u;
+    loop {
         let corner = psao_lowest(block.unsure);
         let offset = psao_corner(corner);
-        let found = psao_search(psao_bucket(table, offset), psao_key(table, offset));
-        block = psao_with(block, corner, found);
-        block.unsure &= block.unsure - 1u;
+        let key = psao_key(table, offset);
+        let found = psao_peek(block.unsure != 0u, psao_bucket(table, offset), key, entry);
+        block = psao_with(block, corner, found.cell);
+        block.unsure &= select(0xffffffffu, block.unsure - 1u, found.last);
+        entry = select(entry + 1u, 0u, found.last);
+        if block.unsure == 0u {
+            break;
+        }
     }
     var left = psao_corners(block);
+    let start = fragment.place - PSAO_HALF_STEP;
     let inverse_radius2 = 1.0 / (grid.radius * grid.radius);
-    var sums = vec2<f32>(0.0);
+    var sums = PsaoSums(vec2<f32>(0.0), vec2<f32>(0.0));
     var round = 0u;
-    while left != 0u {
+    loop {
         let offset = psao_corner(psao_lowest(left));
         let now = psao_round(psao_cell_at(block, offset), psao_key(table, offset), round);
-        let at = fragment.place - vec3<f32>(vec3<i32>(offset));
-        let share = psao_share(at);
-        let place = at - 0.015625;
-        sums = psao_add(sums, inverse_radius2, fragment.normal, place, share, now.points.x);
-        sums = psao_add(sums, inverse_radius2, fragment.normal, place, share, now.points.y);
-        sums = psao_add(sums, inverse_radius2, fragment.normal, place, share, now.points.z);
+        let place = start - vec3<f32>(vec3<i32>(offset));
+        let seen = PsaoSeen(
+            psao_two(fragment.normal, vec3<f32>(0.0)),
+            psao_two(place, vec3<f32>(0.0)),
+            vec2<f32>(inverse_radius2, 0.0),
+            vec2<f32>(psao_share(place), 0.0),
+        );
+        sums = psao_add(sums, seen, now.points.x);
+        sums = psao_add(sums, seen, now.points.y);
+        sums = psao_add(sums, seen, now.points.z);
         round = select(0u, round + 1u, now.more);
         left = select(left & (left - 1u), left, now.more);
+        if left == 0u {
+            break;
+        }
     }
-    let openness = min(sums.y / sums.x * (1.0 / 255.0), 1.0);
-    let near = min(sums.x / (PSAO_NEAR * psao_seen(openness)), 1.0);
-    return select(vec2<f32>(1.0, 0.0), vec2<f32>(openness, near), sums.x > 0.0);
+    let openness = min(sums.openness.x / sums.weights.x * (1.0 / 255.0), 1.0);
+    let near = min(sums.weights.x / (PSAO_NEAR * psao_seen(openness)), 1.0);
+    return select(vec2<f32>(1.0, 0.0), vec2<f32>(openness, near), sums.weights.x > 0.0);
 }
 
 fn psao_planar_fast(instance: u32, position: vec3<f32>, normal: vec3<f32>) -> f32 {

@@ -582,7 +582,7 @@ fn the_race_checks_and_times_every_method_and_keeps_its_pictures() {
     let race = bench_gpu::run(&args, &|_, _, _| ()).expect("a device that times");
     println!("{}", race.table());
     assert!(race.exact_off_255 <= 1.0 && race.fast_off_255 <= 4.0);
-    assert_eq!(race.rows.len(), 6);
+    assert_eq!(race.rows.len(), 7);
     for row in &race.rows {
         assert!(
             row.median_ms > 0.0 && row.p95_ms >= row.median_ms,
@@ -597,7 +597,7 @@ fn the_race_checks_and_times_every_method_and_keeps_its_pictures() {
     let why = race.no_ray_query.expect("nobody asked for ray queries");
     assert!(
         race.table()
-            .contains(&format!("| 1 ray a pixel, ray query   | {why}"))
+            .contains(&format!("| 1 ray a pixel, ray query    | {why}"))
     );
     let of = |name: &str| {
         race.rows
@@ -605,6 +605,10 @@ fn the_race_checks_and_times_every_method_and_keeps_its_pictures() {
             .find(|row| row.method == name)
             .expect("a method")
     };
+    // The fast lookup against both exact ones: the smaller of the two ratios is told.
+    let exact = ["lookup, exact", "lookup, exact, paper kernel"].map(|name| of(name).over_fast);
+    let told = format!("at least {:.2} times fewer ms", exact[0].min(exact[1]));
+    assert!(race.table().contains(&told), "{told}");
     // Noise, and the same without some of it.
     let noisy = of("1 ray a pixel");
     assert!(of("1 ray a pixel, denoised").psnr_db > noisy.psnr_db + 6.0);
@@ -613,7 +617,7 @@ fn the_race_checks_and_times_every_method_and_keeps_its_pictures() {
     let page = std::fs::read_to_string(out.join("report.html")).expect("a report");
     assert_eq!(page.matches("<svg").count(), 2);
     let pictures = std::fs::read_dir(&out).expect("a folder").count();
-    assert_eq!(pictures, 1 + 2 * 7, "a report, and seven pictures a frame");
+    assert_eq!(pictures, 1 + 2 * 8, "a report, and eight pictures a frame");
     let json = std::fs::read_to_string(&json).expect("figures");
     assert!(json.contains("\"median_ms\"") && json.contains("\"adapter\""));
 }

@@ -18,11 +18,18 @@ pub fn tag_of(key: u32) -> u32 {
     (key.wrapping_mul(0x9e37_79b1) >> CELL_BITS).max(1)
 }
 
+/// Cells that a tagged bucket may have: those that one load of 16 bytes brings.
+const MOST: usize = 4;
+
 /// The bucket with tags, as the GPU is to have it. It stays without where two of its cells have the
-/// same tag (one bucket of some hundred): the fast lookup then searches it as the plain one does.
+/// same tag, or where it has more than 4 (together about one bucket of five hundred): the fast
+/// lookup then searches it as the plain one does, and in all others knows after one load.
 ///
 /// `cells`: those that it names, at most [`MAX_CELLS`]; beyond them there are no tags.
 pub fn tagged(bucket: &Bucket, cells: &[Cell]) -> Bucket {
+    if bucket.cells().count() > MOST {
+        return *bucket;
+    }
     let mut out = *bucket;
     for at in 0..bucket.cells().count() {
         let tag = match cells.get(bucket.entries[at] as usize) {
@@ -67,6 +74,21 @@ mod tests {
         }
         // Key 0 has one, too.
         assert_eq!(out.entries[0] >> CELL_BITS, 1);
+    }
+
+    #[test]
+    fn a_bucket_of_more_cells_than_a_load_brings_stays_as_it_is() {
+        let cells: [Cell; 6] = core::array::from_fn(|at| Cell {
+            key: at as u32 * 10,
+            ..Cell::default()
+        });
+        let mut bucket = Bucket {
+            entries: [1, 2, 3, 4, 0, 0, 0, 0],
+        };
+        let four = tagged(&bucket, &cells).entries;
+        assert!(four[..4].iter().all(|entry| entry >> CELL_BITS != 0));
+        bucket.entries[4] = 5;
+        assert_eq!(tagged(&bucket, &cells), bucket);
     }
 
     #[test]

@@ -17,8 +17,8 @@ struct PsaoPixel {
 fn psao_pixel(pixel: vec2<u32>) -> PsaoPixel {
     let position = textureLoad(psao_position, pixel, 0);
     let normal = textureLoad(psao_normal, pixel, 0).xyz;
-    let empty = any(pixel >= textureDimensions(psao_position))
-        || position.w >= arrayLength(&psao_instances) / 4u;
+    // Beyond the picture's edge something finite is read, and what is written there goes nowhere.
+    let empty = position.w >= arrayLength(&psao_instances) / 4u;
     return PsaoPixel(bitcast<vec3<f32>>(position.xyz), normal, position.w, empty);
 }
 
@@ -42,61 +42,6 @@ fn psao_pass_planar(@builtin(global_invocation_id) id: vec3<u32>) {
     textureStore(psao_openness, id.xy, vec4<f32>(openness));
 }
 
-// Three coordinates of two pixels side by side.
-struct PsaoTwo {
-    x: vec2<f32>,
-    y: vec2<f32>,
-    z: vec2<f32>,
-}
-
-fn psao_two(a: vec3<f32>, b: vec3<f32>) -> PsaoTwo {
-    return PsaoTwo(vec2<f32>(a.x, b.x), vec2<f32>(a.y, b.y), vec2<f32>(a.z, b.z));
-}
-
-fn psao_dot_two(a: PsaoTwo, b: PsaoTwo) -> vec2<f32> {
-    return fma(a.x, b.x, fma(a.y, b.y, a.z * b.z));
-}
-
-fn psao_dot_each(a: PsaoTwo, b: vec3<f32>) -> vec2<f32> {
-    return fma(a.x, vec2<f32>(b.x), fma(a.y, vec2<f32>(b.y), a.z * b.z));
-}
-
-// The blends of two pixels.
-struct PsaoSums {
-    weights: vec2<f32>,
-    openness: vec2<f32>,
-}
-
-// psao_add for both.
-fn psao_add_two(
-    sums: PsaoSums,
-    inverse_radius2: vec2<f32>,
-    normal: PsaoTwo,
-    place: PsaoTwo,
-    share: vec2<f32>,
-    word: u32,
-) -> PsaoSums {
-    let point = psao_point(word);
-    let p = point.place;
-    let d = PsaoTwo(p.x - place.x, p.y - place.y, p.z - place.z);
-    let agree = max(psao_dot_each(normal, point.normal), vec2<f32>(0.0));
-    let agree2 = max(agree * agree, vec2<f32>((PSAO_T_N * PSAO_T_N) * point.square));
-    let along = psao_dot_two(normal, d);
-    let point_along = psao_dot_each(d, point.normal);
-    let h2 = max(along * along * point.square, point_along * point_along);
-    let squared = psao_dot_two(d, d);
-    let toward_reach = inverse_radius2 * (-1.0 / PSAO_REACH);
-    let in_reach = max(fma(squared, toward_reach, vec2<f32>(1.0)), vec2<f32>(PSAO_BEYOND));
-    let near = fma(squared, inverse_radius2, vec2<f32>(PSAO_CORE)) * point.square;
-    let apart = fma(h2, PSAO_FLATNESS * inverse_radius2, near);
-    let ratio = agree2 * agree2 / (apart * point.square);
-    let weight = share * point.seen * in_reach * (ratio * ratio);
-    return PsaoSums(
-        sums.weights + weight,
-        fma(weight, vec2<f32>(point.openness), sums.openness),
-    );
-}
-
 // Bits: the corners of a block that another block has, too, which lies so many cells further.
 fn psao_shared(apart: vec3<i32>) -> u32 {
     let same = apart == vec3<i32>(0);
@@ -106,8 +51,21 @@ fn psao_shared(apart: vec3<i32>) -> u32 {
     return axes.x & axes.y & axes.z;
 }
 
-// Far outside of any cell: a place at which none counts.
-const PSAO_NOWHERE: vec3<f32> = vec3<f32>(1000.0);
+// Cells between blocks that have none in common.
+const PSAO_ELSEWHERE: f32 = 64.0;
+
+// One of two tables.
+fn psao_either(a: PsaoTable, b: PsaoTable, second: bool) -> PsaoTable {
+    return PsaoTable(
+        select(a.key, b.key, second),
+        select(a.hash, b.hash, second),
+        select(a.row, b.row, second),
+        select(a.layer, b.layer, second),
+        select(a.bucket_first, b.bucket_first, second),
+        select(a.bucket_count, b.bucket_count, second),
+        select(a.inverse_count, b.inverse_count, second),
+    );
+}
 
 @compute @workgroup_size(64)
 fn psao_pass_fast(
@@ -135,60 +93,66 @@ fn psao_pass_fast(
     let base_b = vec3<u32>(fragment_b.base);
     let table_a = psao_table(grid_a, base_a);
     let table_b = psao_table(grid_b, base_b);
-    var block_a = psao_block(grid_a, table_a, base_a, live_a);
-    // Of the second pixel's block, what the first one's has not.
-    var block_b = PsaoBlock(vec4<u32>(0u), vec4<u32>(0u), 0u);
     let apart = fragment_b.base - fragment_a.base;
-    var todo = select(0u, 255u, live_b) & ~select(0u, psao_shared(-apart), one_grid);
-    while todo != 0u {
-        let corner = psao_lowest(todo);
-        todo &= todo - 1u;
-        let offset = psao_corner(corner);
-        let found = psao_candidate(
-            all(base_b + offset < grid_b.dims),
-            psao_key(table_b, offset),
-            psao_bucket(table_b, offset),
-        );
-        block_b = psao_with(block_b, corner, found.cell);
-        block_b.unsure |= found.unsure << corner;
-    }
-    while (block_a.unsure | block_b.unsure) != 0u {
-        let of_b = block_a.unsure == 0u;
-        let corner = psao_lowest(select(block_a.unsure, block_b.unsure, of_b));
-        let offset = psao_corner(corner);
-        let bucket = select(psao_bucket(table_a, offset), psao_bucket(table_b, offset), of_b);
-        let key = select(psao_key(table_a, offset), psao_key(table_b, offset), of_b);
-        let found = psao_search(bucket, key);
-        block_a = psao_with(block_a, corner, select(found, 0u, of_b));
-        block_b = psao_with(block_b, corner, select(0u, found, of_b));
-        block_b.unsure &= select(0xffffffffu, block_b.unsure - 1u, of_b);
-        block_a.unsure &= select(block_a.unsure - 1u, 0u, of_b);
+    let all_a = select(0u, psao_within(grid_a, base_a), live_a);
+    let all_b = select(0u, psao_within(grid_b, base_b), live_b);
+    var block_a = psao_block(table_a, all_a);
+    // Of the second pixel's block, what the first one's has not.
+    var block_b = psao_block(table_b, all_b & ~select(0u, psao_shared(-apart), one_grid));
+    var unsure = block_a.unsure | (block_b.unsure << 8u);
+    var entry = 0u;
+    loop {
+        let bit = psao_lowest(unsure);
+        let of_b = bit >= 8u;
+        let offset = psao_corner(bit);
+        let table = psao_either(table_a, table_b, of_b);
+        let bucket = psao_bucket(table, offset);
+        let key = psao_key(table, offset);
+        let found = psao_peek(unsure != 0u, bucket, key, entry);
+        block_a = psao_with(block_a, bit, select(found.cell, 0u, of_b));
+        block_b = psao_with(block_b, bit & 7u, select(0u, found.cell, of_b));
+        unsure &= select(0xffffffffu, unsure - 1u, found.last);
+        entry = select(entry + 1u, 0u, found.last);
+        if unsure == 0u {
+            break;
+        }
     }
     var left = psao_corners(block_a) | (psao_corners(block_b) << 8u);
     let normal = psao_two(fragment_a.normal, fragment_b.normal);
     let radius = vec2<f32>(grid_a.radius, grid_b.radius);
     let inverse_radius2 = 1.0 / (radius * radius);
-    // The second pixel seen from the first one's block.
-    let b_from_a = select(PSAO_NOWHERE, fragment_b.place + vec3<f32>(apart), one_grid);
+    // Both pixels and all cells are seen from the first pixel's block. The second one's lies beside
+    // it, or so far off that neither has a share in the other's cells.
+    let beside = one_grid && all(abs(apart) <= vec3<i32>(1));
+    let between = select(vec3<f32>(PSAO_ELSEWHERE, 0.0, 0.0), vec3<f32>(apart), beside);
+    let start_a = fragment_a.place - PSAO_HALF_STEP;
+    let start_b = fragment_b.place - PSAO_HALF_STEP + between;
     var sums = PsaoSums(vec2<f32>(0.0), vec2<f32>(0.0));
     var round = 0u;
-    while left != 0u {
+    loop {
         let bit = psao_lowest(left);
         let of_b = bit >= 8u;
         let offset = psao_corner(bit);
         let cell = select(psao_cell_at(block_a, offset), psao_cell_at(block_b, offset), of_b);
-        let key = select(psao_key(table_a, offset), psao_key(table_b, offset), of_b);
+        let key = psao_key(psao_either(table_a, table_b, of_b), offset);
         let now = psao_round(cell, key, round);
-        let lower = vec3<f32>(vec3<i32>(offset));
-        let place_a = select(fragment_a.place, PSAO_NOWHERE, of_b) - lower;
-        let place_b = select(b_from_a, fragment_b.place, of_b) - lower;
-        let share = vec2<f32>(psao_share(place_a), psao_share(place_b));
-        let place = psao_two(place_a - 0.015625, place_b - 0.015625);
-        sums = psao_add_two(sums, inverse_radius2, normal, place, share, now.points.x);
-        sums = psao_add_two(sums, inverse_radius2, normal, place, share, now.points.y);
-        sums = psao_add_two(sums, inverse_radius2, normal, place, share, now.points.z);
+        let lower = vec3<f32>(vec3<i32>(offset)) + select(vec3<f32>(0.0), between, of_b);
+        let place_a = start_a - lower;
+        let place_b = start_b - lower;
+        let seen = PsaoSeen(
+            normal,
+            psao_two(place_a, place_b),
+            inverse_radius2,
+            vec2<f32>(psao_share(place_a), psao_share(place_b)),
+        );
+        sums = psao_add(sums, seen, now.points.x);
+        sums = psao_add(sums, seen, now.points.y);
+        sums = psao_add(sums, seen, now.points.z);
         round = select(0u, round + 1u, now.more);
         left = select(left & (left - 1u), left, now.more);
+        if left == 0u {
+            break;
+        }
     }
     let blend = min(sums.openness / sums.weights * (1.0 / 255.0), vec2<f32>(1.0));
     let openness = select(vec2<f32>(1.0), blend, sums.weights > vec2<f32>(0.0));

@@ -69,6 +69,11 @@ struct PsaoBlock {
     int _end_pad_2;
 };
 
+struct PsaoPeek {
+    uint cell;
+    bool last;
+};
+
 struct PsaoRound {
     uint3 points;
     bool more;
@@ -85,6 +90,24 @@ struct PsaoPoint {
     int _end_pad_1;
 };
 
+struct PsaoTwo {
+    float2 x;
+    float2 y;
+    float2 z;
+};
+
+struct PsaoSums {
+    float2 weights;
+    float2 openness;
+};
+
+struct PsaoSeen {
+    PsaoTwo normal;
+    PsaoTwo place;
+    float2 inverse_radius2_;
+    float2 share;
+};
+
 static const float PSAO_T_N = 0.1;
 static const float PSAO_T_D = 0.7;
 static const float PSAO_FLATNESS = 30.0;
@@ -97,6 +120,7 @@ static const float PSAO_UNSEEN = 0.0001;
 static const float PSAO_NEAR = 0.05;
 static const uint PSAO_PAPER = 0u;
 static const uint PSAO_ENTRY_CELL = 4194303u;
+static const float PSAO_HALF_STEP = 0.015625;
 
 ByteAddressBuffer psao_instances : register(t0);
 ByteAddressBuffer psao_buckets : register(t1);
@@ -206,13 +230,13 @@ uint psao_search(uint bucket, uint key)
             uint _e9 = i;
             const uint4 _e13 = psao_load_bucket(((bucket * 2u) + (_e9 >> 2u)));
             uint _e14 = i;
-            uint entry = (_e13[(_e14 & 3u)] & PSAO_ENTRY_CELL);
-            if ((entry == 0u)) {
+            uint entry_2 = (_e13[(_e14 & 3u)] & PSAO_ENTRY_CELL);
+            if ((entry_2 == 0u)) {
                 break;
             }
-            const uint4 _e24 = psao_load_cell((entry * 2u));
+            const uint4 _e24 = psao_load_cell((entry_2 * 2u));
             if ((_e24.x == key)) {
-                return entry;
+                return entry_2;
             }
         }
     }
@@ -226,9 +250,9 @@ uint psao_naga_mod(uint lhs, uint rhs) {
 uint psao_find(PsaoGrid grid_2, uint3 cell_1)
 {
     const uint _e5 = psao_weigh(grid_2, cell_1, 17u, 31u);
-    uint bucket_2 = (grid_2.bucket_first + psao_naga_mod(_e5, grid_2.bucket_count));
+    uint bucket_3 = (grid_2.bucket_first + psao_naga_mod(_e5, grid_2.bucket_count));
     const uint _e11 = psao_weigh(grid_2, cell_1, 1u, 1u);
-    const uint _e12 = psao_search(bucket_2, _e11);
+    const uint _e12 = psao_search(bucket_3, _e11);
     return _e12;
 }
 
@@ -395,9 +419,9 @@ float2 psao_blend(bool planar, uint instance_2, float3 position_2, float3 normal
         float _e96 = weights;
         float openness_1 = min((_e95 / _e96), 1.0);
         const float _e100 = psao_seen(openness_1);
-        float seen = (planar ? _e100 : 1.0);
+        float seen_1 = (planar ? _e100 : 1.0);
         float _e103 = weights;
-        return float2(openness_1, min((_e103 / (PSAO_NEAR * seen)), 1.0));
+        return float2(openness_1, min((_e103 / (PSAO_NEAR * seen_1)), 1.0));
     }
     return float2(1.0, 0.0);
 }
@@ -419,16 +443,18 @@ uint psao_tag(uint key_1)
     return max(((key_1 * 2654435761u) & 4290772992u), 4194304u);
 }
 
-uint psao_naga_f2u32(float value) {
-    return uint(clamp(value, 0.0, 4294967000.0));
+int psao_naga_f2i32(float value) {
+    return int(clamp(value, -2147483600.0, 2147483500.0));
 }
 
 uint psao_modulo(uint hash, uint count, float inverse)
 {
-    uint left_2 = (hash - (psao_naga_f2u32(((float(hash) * inverse) * 0.999999)) * count));
-    uint rest = (left_2 - (psao_naga_f2u32((float(left_2) * inverse)) * count));
-    uint raised = ((rest >= 2147483648u) ? (rest + count) : rest);
-    return ((raised >= count) ? (raised - count) : raised);
+    int left_2 = int((hash - (uint(psao_naga_f2i32((float(int((hash >> 1u))) * (inverse * 1.999998)))) * count)));
+    int divisor = int(count);
+    int rest = asint(asuint(left_2) - asuint(asint(asuint(psao_naga_f2i32((float(left_2) * inverse))) * asuint(divisor))));
+    int raised = ((rest < int(0)) ? asint(asuint(rest) + asuint(divisor)) : rest);
+    int whole = ((raised >= divisor) ? asint(asuint(raised) - asuint(divisor)) : raised);
+    return ((count == 1u) ? 0u : uint(whole));
 }
 
 uint psao_lowest(uint bits)
@@ -502,9 +528,6 @@ PsaoCandidate ConstructPsaoCandidate(uint arg0, uint arg1) {
 
 PsaoCandidate psao_candidate(bool there, uint key_2, uint bucket_1)
 {
-    bool local_4 = (bool)0;
-    bool local_5 = (bool)0;
-
     if (!(there)) {
         const PsaoCandidate psaocandidate = ConstructPsaoCandidate(0u, 0u);
         return psaocandidate;
@@ -513,18 +536,7 @@ PsaoCandidate psao_candidate(bool there, uint key_2, uint bucket_1)
     const uint _e10 = psao_tag(key_2);
     const uint _e11 = psao_pick(_e9, _e10);
     bool here = (_e11 <= PSAO_ENTRY_CELL);
-    if (!(here)) {
-        local_4 = (_e9.w != 0u);
-    } else {
-        local_4 = false;
-    }
-    bool _e21 = local_4;
-    if (!(_e21)) {
-        local_5 = ((_e9.x - 1u) < PSAO_ENTRY_CELL);
-    } else {
-        local_5 = true;
-    }
-    bool unsure = local_5;
+    bool unsure = ((_e9.x - 1u) < PSAO_ENTRY_CELL);
     const PsaoCandidate psaocandidate_1 = ConstructPsaoCandidate((here ? _e11 : 0u), (unsure ? 1u : 0u));
     return psaocandidate_1;
 }
@@ -549,6 +561,14 @@ PsaoPair psao_pair(PsaoTable table_2, bool2 there_1, uint2 row)
     return psaopair;
 }
 
+uint psao_within(PsaoGrid grid_5, uint3 base_1)
+{
+    uint3 low = (uint3((base_1 < grid_5.dims)) * uint3(85u, 51u, 15u));
+    uint3 high = (uint3(((base_1 + (1u).xxx) < grid_5.dims)) * uint3(170u, 204u, 240u));
+    uint3 axes = (low | high);
+    return ((axes.x & axes.y) & axes.z);
+}
+
 PsaoBlock ConstructPsaoBlock(uint4 arg0, uint4 arg1, uint arg2) {
     PsaoBlock ret = (PsaoBlock)0;
     ret.lower = arg0;
@@ -557,45 +577,15 @@ PsaoBlock ConstructPsaoBlock(uint4 arg0, uint4 arg1, uint arg2) {
     return ret;
 }
 
-PsaoBlock psao_block(PsaoGrid grid_5, PsaoTable table_3, uint3 base_1, bool live)
+PsaoBlock psao_block(PsaoTable table_3, uint corners)
 {
-    bool local_6 = (bool)0;
-    bool local_7 = (bool)0;
-    bool local_8 = (bool)0;
-    bool local_9 = (bool)0;
-
-    bool3 low = ((base_1 < grid_5.dims) & (live).xxx);
-    bool3 high = (((base_1 + (1u).xxx) < grid_5.dims) & (live).xxx);
-    bool2 x = bool2(low.x, high.x);
-    if (low.y) {
-        local_6 = low.z;
-    } else {
-        local_6 = false;
-    }
-    bool _e23 = local_6;
-    const PsaoPair _e29 = psao_pair(table_3, (x & (_e23).xx), uint2(0u, 0u));
-    if (high.y) {
-        local_7 = low.z;
-    } else {
-        local_7 = false;
-    }
-    bool _e35 = local_7;
-    const PsaoPair _e41 = psao_pair(table_3, (x & (_e35).xx), uint2(1u, 0u));
-    if (low.y) {
-        local_8 = high.z;
-    } else {
-        local_8 = false;
-    }
-    bool _e47 = local_8;
-    const PsaoPair _e53 = psao_pair(table_3, (x & (_e47).xx), uint2(0u, 1u));
-    if (high.y) {
-        local_9 = high.z;
-    } else {
-        local_9 = false;
-    }
-    bool _e59 = local_9;
-    const PsaoPair _e65 = psao_pair(table_3, (x & (_e59).xx), uint2(1u, 1u));
-    const PsaoBlock psaoblock = ConstructPsaoBlock(uint4(_e29.cells, _e41.cells), uint4(_e53.cells, _e65.cells), (((_e29.unsure | (_e41.unsure << 2u)) | (_e53.unsure << 4u)) | (_e65.unsure << 6u)));
+    bool4 low_1 = (((corners).xxxx & uint4(1u, 2u, 4u, 8u)) != (0u).xxxx);
+    bool4 high_1 = (((corners).xxxx & uint4(16u, 32u, 64u, 128u)) != (0u).xxxx);
+    const PsaoPair _e26 = psao_pair(table_3, low_1.xy, uint2(0u, 0u));
+    const PsaoPair _e31 = psao_pair(table_3, low_1.zw, uint2(1u, 0u));
+    const PsaoPair _e36 = psao_pair(table_3, high_1.xy, uint2(0u, 1u));
+    const PsaoPair _e41 = psao_pair(table_3, high_1.zw, uint2(1u, 1u));
+    const PsaoBlock psaoblock = ConstructPsaoBlock(uint4(_e26.cells, _e31.cells), uint4(_e36.cells, _e41.cells), (((_e26.unsure | (_e31.unsure << 2u)) | (_e36.unsure << 4u)) | (_e41.unsure << 6u)));
     return psaoblock;
 }
 
@@ -603,8 +593,8 @@ PsaoBlock psao_with(PsaoBlock block, uint corner_2, uint cell_2)
 {
     bool4 here_1 = (uint4(0u, 1u, 2u, 3u) == ((corner_2 & 3u)).xxxx);
     uint4 cells = (uint4(here_1) * cell_2);
-    uint4 high_1 = (((corner_2 >= 4u) ? 4294967295u : 0u)).xxxx;
-    const PsaoBlock psaoblock_1 = ConstructPsaoBlock((block.lower | (cells & ~(high_1))), (block.upper | (cells & high_1)), block.unsure);
+    uint4 high_2 = (((corner_2 >= 4u) ? 4294967295u : 0u)).xxxx;
+    const PsaoBlock psaoblock_1 = ConstructPsaoBlock((block.lower | (cells & ~(high_2))), (block.upper | (cells & high_2)), block.unsure);
     return psaoblock_1;
 }
 
@@ -622,6 +612,48 @@ uint psao_cell_at(PsaoBlock block_2, uint3 offset_3)
     return ((offset_3.z != 0u) ? upper : lower_1);
 }
 
+PsaoPeek ConstructPsaoPeek(uint arg0, bool arg1) {
+    PsaoPeek ret = (PsaoPeek)0;
+    ret.cell = arg0;
+    ret.last = arg1;
+    return ret;
+}
+
+PsaoPeek psao_peek(bool wanted, uint bucket_2, uint key_3, uint entry)
+{
+    bool local_4 = (bool)0;
+    bool local_5 = (bool)0;
+    bool local_6 = (bool)0;
+
+    if (!(wanted)) {
+        const PsaoPeek psaopeek = ConstructPsaoPeek(0u, true);
+        return psaopeek;
+    }
+    const uint4 _e13 = psao_load_bucket(((bucket_2 * 2u) + (entry >> 2u)));
+    uint cell_5 = (_e13[(entry & 3u)] & PSAO_ENTRY_CELL);
+    if ((cell_5 != 0u)) {
+        const uint4 _e25 = psao_load_cell((cell_5 * 2u));
+        local_4 = (_e25.x == key_3);
+    } else {
+        local_4 = false;
+    }
+    bool here_2 = local_4;
+    if (!(here_2)) {
+        local_5 = (cell_5 == 0u);
+    } else {
+        local_5 = true;
+    }
+    bool _e38 = local_5;
+    if (!(_e38)) {
+        local_6 = (entry == 7u);
+    } else {
+        local_6 = true;
+    }
+    bool _e45 = local_6;
+    const PsaoPeek psaopeek_1 = ConstructPsaoPeek((here_2 ? cell_5 : 0u), _e45);
+    return psaopeek_1;
+}
+
 PsaoRound ConstructPsaoRound(uint3 arg0, bool arg1) {
     PsaoRound ret = (PsaoRound)0;
     ret.points = arg0;
@@ -629,28 +661,29 @@ PsaoRound ConstructPsaoRound(uint3 arg0, bool arg1) {
     return ret;
 }
 
-PsaoRound psao_round(uint cell_3, uint key_3, uint round_)
+PsaoRound psao_round(uint cell_3, uint key_4, uint round_)
 {
-    bool local_10 = (bool)0;
+    bool local_7 = (bool)0;
 
     const uint4 _e8 = psao_load_cell(((cell_3 * 2u) + min(round_, 1u)));
-    uint first = ((round_ == 0u) ? ((_e8.x == key_3) ? _e8.y : 0u) : _e8.x);
-    uint a_1 = ((round_ == 2u) ? _e8.w : first);
-    if (!((a_1 == 0u))) {
-        local_10 = (round_ == 2u);
+    uint first = ((round_ == 0u) ? ((_e8.x == key_4) ? _e8.y : 0u) : _e8.x);
+    uint a_3 = ((round_ == 2u) ? _e8.w : first);
+    if (!((a_3 == 0u))) {
+        local_7 = (round_ == 2u);
     } else {
-        local_10 = true;
+        local_7 = true;
     }
-    bool _e36 = local_10;
-    uint b_1 = (_e36 ? 0u : ((round_ == 0u) ? _e8.z : _e8.y));
-    uint c = ((b_1 == 0u) ? 0u : ((round_ == 0u) ? _e8.w : _e8.z));
-    const PsaoRound psaoround = ConstructPsaoRound(uint3(a_1, b_1, c), (c != 0u));
+    bool _e36 = local_7;
+    uint b_3 = (_e36 ? 0u : ((round_ == 0u) ? _e8.z : _e8.y));
+    uint c = ((b_3 == 0u) ? 0u : ((round_ == 0u) ? _e8.w : _e8.z));
+    const PsaoRound psaoround = ConstructPsaoRound(uint3(a_3, b_3, c), (c != 0u));
     return psaoround;
 }
 
 float psao_share(float3 place_1)
 {
-    float3 sides_1 = clamp((((1.0).xxx - abs((place_1 - (0.5).xxx))) / (0.3).xxx), (0.0).xxx, (1.0).xxx);
+    float3 inside_1 = ((1.0).xxx - abs((place_1 - (0.484375).xxx)));
+    float3 sides_1 = clamp((inside_1 * 3.3333333), (0.0).xxx, (1.0).xxx);
     return ((sides_1.x * sides_1.y) * sides_1.z);
 }
 
@@ -675,142 +708,183 @@ PsaoPoint psao_point(uint point_3)
     float3 m = float3((uv_1 - ((uv_1 < (0.0).xx) ? (-(fold)).xx : (fold).xx)), z_1);
     float openness_2 = float(int((point_3 & 255u)));
     float lit_1 = min((openness_2 * 0.019607844), 1.0);
-    float seen_1 = mad(lit_1, lit_1, PSAO_UNSEEN);
-    const PsaoPoint psaopoint = ConstructPsaoPoint((float3(steps_1) * scale), m, mad(m.x, m.x, mad(m.y, m.y, (m.z * m.z))), openness_2, ((int(point_3) >= int(0)) ? 0.0 : seen_1));
+    float seen_2 = mad(lit_1, lit_1, PSAO_UNSEEN);
+    const PsaoPoint psaopoint = ConstructPsaoPoint((float3(steps_1) * scale), m, mad(m.x, m.x, mad(m.y, m.y, (m.z * m.z))), openness_2, ((int(point_3) >= int(0)) ? 0.0 : seen_2));
     return psaopoint;
 }
 
-float psao_dot(float3 a, float3 b)
-{
-    return mad(a.x, b.x, mad(a.y, b.y, (a.z * b.z)));
+PsaoTwo ConstructPsaoTwo(float2 arg0, float2 arg1, float2 arg2) {
+    PsaoTwo ret = (PsaoTwo)0;
+    ret.x = arg0;
+    ret.y = arg1;
+    ret.z = arg2;
+    return ret;
 }
 
-float2 psao_add(float2 sums, float inverse_radius2_, float3 normal_7, float3 place_2, float share, uint word)
+PsaoTwo psao_two(float3 a, float3 b)
 {
-    const PsaoPoint _e6 = psao_point(word);
-    float3 d_3 = (_e6.place - place_2);
-    const float _e10 = psao_dot(_e6.normal, normal_7);
-    float agree_1 = max(_e10, 0.0);
-    float agree2_1 = max((agree_1 * agree_1), (0.010000001 * _e6.square));
-    const float _e18 = psao_dot(normal_7, d_3);
-    const float _e20 = psao_dot(_e6.normal, d_3);
-    float h2_ = max(((_e18 * _e18) * _e6.square), (_e20 * _e20));
-    const float _e26 = psao_dot(d_3, d_3);
-    float in_reach_1 = max(mad(_e26, (inverse_radius2_ * -0.8333333), 1.0), PSAO_BEYOND);
-    float near = (mad(_e26, inverse_radius2_, PSAO_CORE) * _e6.square);
-    float apart_1 = mad(h2_, (PSAO_FLATNESS * inverse_radius2_), near);
-    float ratio = ((agree2_1 * agree2_1) / (apart_1 * _e6.square));
-    float weight_1 = (((share * _e6.seen) * in_reach_1) * (ratio * ratio));
-    return mad((weight_1).xx, float2(1.0, _e6.openness), sums);
+    const PsaoTwo psaotwo = ConstructPsaoTwo(float2(a.x, b.x), float2(a.y, b.y), float2(a.z, b.z));
+    return psaotwo;
 }
 
-float2 psao_blend_fast(uint instance_6, float3 position_5, float3 normal_8)
+float2 psao_dot_two(PsaoTwo a_1, PsaoTwo b_1)
+{
+    return mad(a_1.x, b_1.x, mad(a_1.y, b_1.y, (a_1.z * b_1.z)));
+}
+
+float2 psao_dot_each(PsaoTwo a_2, float3 b_2)
+{
+    return mad(a_2.x, (b_2.x).xx, mad(a_2.y, (b_2.y).xx, (a_2.z * b_2.z)));
+}
+
+PsaoSums ConstructPsaoSums(float2 arg0, float2 arg1) {
+    PsaoSums ret = (PsaoSums)0;
+    ret.weights = arg0;
+    ret.openness = arg1;
+    return ret;
+}
+
+PsaoSums psao_add(PsaoSums sums, PsaoSeen seen, uint word)
+{
+    const PsaoPoint _e3 = psao_point(word);
+    float3 p = _e3.place;
+    PsaoTwo d_3 = ConstructPsaoTwo(((p.x).xx - seen.place.x), ((p.y).xx - seen.place.y), ((p.z).xx - seen.place.z));
+    const float2 _e23 = psao_dot_each(seen.normal, _e3.normal);
+    float2 agree_1 = max(_e23, (0.0).xx);
+    float2 agree2_1 = max((agree_1 * agree_1), ((0.010000001 * _e3.square)).xx);
+    const float2 _e34 = psao_dot_two(seen.normal, d_3);
+    const float2 _e36 = psao_dot_each(d_3, _e3.normal);
+    float2 h2_ = max(((_e34 * _e34) * _e3.square), (_e36 * _e36));
+    const float2 _e42 = psao_dot_two(d_3, d_3);
+    float2 to_reach = (seen.inverse_radius2_ * -0.8333333);
+    float2 in_reach_1 = max(mad(_e42, to_reach, (1.0).xx), (0.001).xx);
+    float2 near = (mad(_e42, seen.inverse_radius2_, (0.5).xx) * _e3.square);
+    float2 apart_1 = (mad(h2_, (PSAO_FLATNESS * seen.inverse_radius2_), near) * _e3.square);
+    float2 ratio = ((agree2_1 * agree2_1) / apart_1);
+    float2 weight_1 = (((seen.share * _e3.seen) * in_reach_1) * (ratio * ratio));
+    const PsaoSums psaosums = ConstructPsaoSums((sums.weights + weight_1), mad(weight_1, (_e3.openness).xx, sums.openness));
+    return psaosums;
+}
+
+PsaoSeen ConstructPsaoSeen(PsaoTwo arg0, PsaoTwo arg1, float2 arg2, float2 arg3) {
+    PsaoSeen ret = (PsaoSeen)0;
+    ret.normal = arg0;
+    ret.place = arg1;
+    ret.inverse_radius2_ = arg2;
+    ret.share = arg3;
+    return ret;
+}
+
+float2 psao_blend_fast(uint instance_6, float3 position_5, float3 normal_7)
 {
     PsaoBlock block_3 = (PsaoBlock)0;
+    uint entry_1 = 0u;
     uint left = (uint)0;
-    float2 sums_1 = (0.0).xx;
+    PsaoSums sums_1 = ConstructPsaoSums((0.0).xx, (0.0).xx);
     uint round_1 = 0u;
 
     const PsaoGrid _e3 = psao_grid_fast(instance_6);
-    const PsaoFragment _e4 = psao_fragment(_e3, position_5, normal_8);
+    const PsaoFragment _e4 = psao_fragment(_e3, position_5, normal_7);
     if (_e4.outside) {
         return float2(1.0, 0.0);
     }
     uint3 base_2 = uint3(_e4.base);
     const PsaoTable _e11 = psao_table(_e3, base_2);
-    const PsaoBlock _e13 = psao_block(_e3, _e11, base_2, true);
+    const uint _e12 = psao_within(_e3, base_2);
+    const PsaoBlock _e13 = psao_block(_e11, _e12);
     block_3 = _e13;
     while(true) {
-        uint _e16 = block_3.unsure;
-        if ((_e16 != 0u)) {
-        } else {
+        uint _e18 = block_3.unsure;
+        const uint _e19 = psao_lowest(_e18);
+        const uint3 _e20 = psao_corner(_e19);
+        const uint _e21 = psao_key(_e11, _e20);
+        uint _e23 = block_3.unsure;
+        const uint _e26 = psao_bucket(_e11, _e20);
+        uint _e27 = entry_1;
+        const PsaoPeek _e28 = psao_peek((_e23 != 0u), _e26, _e21, _e27);
+        PsaoBlock _e29 = block_3;
+        const PsaoBlock _e31 = psao_with(_e29, _e19, _e28.cell);
+        block_3 = _e31;
+        uint _e33 = block_3.unsure;
+        uint _e36 = block_3.unsure;
+        block_3.unsure = (_e33 & (_e28.last ? (_e36 - 1u) : 4294967295u));
+        uint _e42 = entry_1;
+        entry_1 = (_e28.last ? 0u : (_e42 + 1u));
+        uint _e49 = block_3.unsure;
+        if ((_e49 == 0u)) {
             break;
         }
-        {
-            uint _e20 = block_3.unsure;
-            const uint _e21 = psao_lowest(_e20);
-            const uint3 _e22 = psao_corner(_e21);
-            const uint _e23 = psao_bucket(_e11, _e22);
-            const uint _e24 = psao_key(_e11, _e22);
-            const uint _e25 = psao_search(_e23, _e24);
-            PsaoBlock _e26 = block_3;
-            const PsaoBlock _e27 = psao_with(_e26, _e21, _e25);
-            block_3 = _e27;
-            uint _e29 = block_3.unsure;
-            uint _e31 = block_3.unsure;
-            block_3.unsure = (_e29 & (_e31 - 1u));
-        }
     }
-    PsaoBlock _e35 = block_3;
-    const uint _e36 = psao_corners(_e35);
-    left = _e36;
-    float inverse_radius2_1 = (1.0 / (_e3.radius * _e3.radius));
+    PsaoBlock _e52 = block_3;
+    const uint _e53 = psao_corners(_e52);
+    left = _e53;
+    float3 start = (_e4.place - (0.015625).xxx);
+    float inverse_radius2_ = (1.0 / (_e3.radius * _e3.radius));
     while(true) {
-        uint _e48 = left;
-        if ((_e48 != 0u)) {
-        } else {
+        uint _e72 = left;
+        const uint _e73 = psao_lowest(_e72);
+        const uint3 _e74 = psao_corner(_e73);
+        PsaoBlock _e75 = block_3;
+        const uint _e76 = psao_cell_at(_e75, _e74);
+        const uint _e77 = psao_key(_e11, _e74);
+        uint _e78 = round_1;
+        const PsaoRound _e79 = psao_round(_e76, _e77, _e78);
+        float3 place_2 = (start - float3(int3(_e74)));
+        const PsaoTwo _e86 = psao_two(_e4.normal, (0.0).xxx);
+        const PsaoTwo _e89 = psao_two(place_2, (0.0).xxx);
+        const float _e92 = psao_share(place_2);
+        PsaoSeen seen_3 = ConstructPsaoSeen(_e86, _e89, float2(inverse_radius2_, 0.0), float2(_e92, 0.0));
+        PsaoSums _e96 = sums_1;
+        const PsaoSums _e99 = psao_add(_e96, seen_3, _e79.points.x);
+        sums_1 = _e99;
+        PsaoSums _e100 = sums_1;
+        const PsaoSums _e103 = psao_add(_e100, seen_3, _e79.points.y);
+        sums_1 = _e103;
+        PsaoSums _e104 = sums_1;
+        const PsaoSums _e107 = psao_add(_e104, seen_3, _e79.points.z);
+        sums_1 = _e107;
+        uint _e109 = round_1;
+        round_1 = (_e79.more ? (_e109 + 1u) : 0u);
+        uint _e114 = left;
+        uint _e115 = left;
+        uint _e119 = left;
+        left = (_e79.more ? _e119 : (_e114 & (_e115 - 1u)));
+        uint _e122 = left;
+        if ((_e122 == 0u)) {
             break;
         }
-        {
-            uint _e51 = left;
-            const uint _e52 = psao_lowest(_e51);
-            const uint3 _e53 = psao_corner(_e52);
-            PsaoBlock _e54 = block_3;
-            const uint _e55 = psao_cell_at(_e54, _e53);
-            const uint _e56 = psao_key(_e11, _e53);
-            uint _e57 = round_1;
-            const PsaoRound _e58 = psao_round(_e55, _e56, _e57);
-            float3 at = (_e4.place - float3(int3(_e53)));
-            const float _e63 = psao_share(at);
-            float3 place_3 = (at - (0.015625).xxx);
-            float2 _e67 = sums_1;
-            const float2 _e71 = psao_add(_e67, inverse_radius2_1, _e4.normal, place_3, _e63, _e58.points.x);
-            sums_1 = _e71;
-            float2 _e72 = sums_1;
-            const float2 _e76 = psao_add(_e72, inverse_radius2_1, _e4.normal, place_3, _e63, _e58.points.y);
-            sums_1 = _e76;
-            float2 _e77 = sums_1;
-            const float2 _e81 = psao_add(_e77, inverse_radius2_1, _e4.normal, place_3, _e63, _e58.points.z);
-            sums_1 = _e81;
-            uint _e83 = round_1;
-            round_1 = (_e58.more ? (_e83 + 1u) : 0u);
-            uint _e88 = left;
-            uint _e89 = left;
-            uint _e93 = left;
-            left = (_e58.more ? _e93 : (_e88 & (_e89 - 1u)));
-        }
     }
-    float _e97 = sums_1.y;
-    float _e99 = sums_1.x;
-    float openness_3 = min(((_e97 / _e99) * 0.003921569), 1.0);
-    float _e106 = sums_1.x;
-    const float _e108 = psao_seen(openness_3);
-    float near_1 = min((_e106 / (PSAO_NEAR * _e108)), 1.0);
-    float _e118 = sums_1.x;
-    return ((_e118 > 0.0) ? float2(openness_3, near_1) : float2(1.0, 0.0));
+    float _e127 = sums_1.openness.x;
+    float _e130 = sums_1.weights.x;
+    float openness_3 = min(((_e127 / _e130) * 0.003921569), 1.0);
+    float _e138 = sums_1.weights.x;
+    const float _e140 = psao_seen(openness_3);
+    float near_1 = min((_e138 / (PSAO_NEAR * _e140)), 1.0);
+    float _e151 = sums_1.weights.x;
+    return ((_e151 > 0.0) ? float2(openness_3, near_1) : float2(1.0, 0.0));
 }
 
-float psao_planar_fast(uint instance_7, float3 position_6, float3 normal_9)
+float psao_planar_fast(uint instance_7, float3 position_6, float3 normal_8)
 {
-    const float2 _e3 = psao_blend_fast(instance_7, position_6, normal_9);
+    const float2 _e3 = psao_blend_fast(instance_7, position_6, normal_8);
     return _e3.x;
 }
 
-float psao_over_baked(uint kernel, uint instance_8, float3 position_7, float3 normal_10, float baked, float share_1)
+float psao_over_baked(uint kernel, uint instance_8, float3 position_7, float3 normal_9, float baked, float share)
 {
     float2 found = float2(1.0, 0.0);
 
-    if ((share_1 <= 0.0)) {
+    if ((share <= 0.0)) {
         return baked;
     }
     if ((kernel == PSAO_PAPER)) {
-        const float2 _e15 = psao_blend(false, instance_8, position_7, normal_10);
+        const float2 _e15 = psao_blend(false, instance_8, position_7, normal_9);
         found = _e15;
     } else {
-        const float2 _e16 = psao_blend_fast(instance_8, position_7, normal_10);
+        const float2 _e16 = psao_blend_fast(instance_8, position_7, normal_9);
         found = _e16;
     }
     float _e18 = found.x;
     float _e20 = found.y;
-    return lerp(baked, _e18, (_e20 * min(share_1, 1.0)));
+    return lerp(baked, _e18, (_e20 * min(share, 1.0)));
 }

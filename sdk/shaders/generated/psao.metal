@@ -67,6 +67,11 @@ struct PsaoBlock {
     uint unsure;
     char _pad3[12];
 };
+struct PsaoPeek {
+    uint cell;
+    bool last;
+    char _pad2[3];
+};
 struct PsaoRound {
     metal::packed_uint3 points;
     bool more;
@@ -80,6 +85,21 @@ struct PsaoPoint {
     float seen;
     char _pad5[8];
 };
+struct PsaoTwo {
+    metal::float2 x;
+    metal::float2 y;
+    metal::float2 z;
+};
+struct PsaoSums {
+    metal::float2 weights;
+    metal::float2 openness;
+};
+struct PsaoSeen {
+    PsaoTwo normal;
+    PsaoTwo place;
+    metal::float2 inverse_radius2_;
+    metal::float2 share;
+};
 constant float PSAO_T_N = 0.1;
 constant float PSAO_T_D = 0.7;
 constant float PSAO_FLATNESS = 30.0;
@@ -92,6 +112,7 @@ constant float PSAO_UNSEEN = 0.0001;
 constant float PSAO_NEAR = 0.05;
 constant uint PSAO_PAPER = 0u;
 constant uint PSAO_ENTRY_CELL = 4194303u;
+constant float PSAO_HALF_STEP = 0.015625;
 
 metal::uint4 psao_load_instance(
     uint index,
@@ -191,13 +212,13 @@ uint psao_search(
             uint _e9 = i;
             metal::uint4 _e13 = psao_load_bucket((bucket * 2u) + (_e9 >> 2u), psao_buckets);
             uint _e14 = i;
-            uint entry = _e13[_e14 & 3u] & PSAO_ENTRY_CELL;
-            if (entry == 0u) {
+            uint entry_2 = _e13[_e14 & 3u] & PSAO_ENTRY_CELL;
+            if (entry_2 == 0u) {
                 break;
             }
-            metal::uint4 _e24 = psao_load_cell(entry * 2u, psao_cells);
+            metal::uint4 _e24 = psao_load_cell(entry_2 * 2u, psao_cells);
             if (_e24.x == key) {
-                return entry;
+                return entry_2;
             }
         }
     }
@@ -215,9 +236,9 @@ uint psao_find(
     device PsaoWords const& psao_cells
 ) {
     uint _e5 = psao_weigh(grid_2, cell_1, 17u, 31u);
-    uint bucket_2 = grid_2.bucket_first + psao_naga_mod(_e5, grid_2.bucket_count);
+    uint bucket_3 = grid_2.bucket_first + psao_naga_mod(_e5, grid_2.bucket_count);
     uint _e11 = psao_weigh(grid_2, cell_1, 1u, 1u);
-    uint _e12 = psao_search(bucket_2, _e11, psao_buckets, psao_cells);
+    uint _e12 = psao_search(bucket_3, _e11, psao_buckets, psao_cells);
     return _e12;
 }
 
@@ -403,9 +424,9 @@ metal::float2 psao_blend(
         float _e96 = weights;
         float openness_1 = metal::min(_e95 / _e96, 1.0);
         float _e100 = psao_seen(openness_1);
-        float seen = planar ? _e100 : 1.0;
+        float seen_1 = planar ? _e100 : 1.0;
         float _e103 = weights;
-        return metal::float2(openness_1, metal::min(_e103 / (PSAO_NEAR * seen), 1.0));
+        return metal::float2(openness_1, metal::min(_e103 / (PSAO_NEAR * seen_1), 1.0));
     }
     return metal::float2(1.0, 0.0);
 }
@@ -440,8 +461,8 @@ uint psao_tag(
     return metal::max((key_1 * 2654435761u) & 4290772992u, 4194304u);
 }
 
-uint psao_naga_f2u32(float value) {
-    return static_cast<uint>(metal::clamp(value, 0.0, 4294967000.0));
+int psao_naga_f2i32(float value) {
+    return static_cast<int>(metal::clamp(value, -2147483600.0, 2147483500.0));
 }
 
 uint psao_modulo(
@@ -449,10 +470,12 @@ uint psao_modulo(
     uint count,
     float inverse
 ) {
-    uint left_2 = hash - (psao_naga_f2u32((static_cast<float>(hash) * inverse) * 0.999999) * count);
-    uint rest = left_2 - (psao_naga_f2u32(static_cast<float>(left_2) * inverse) * count);
-    uint raised = (rest >= 2147483648u) ? (rest + count) : rest;
-    return (raised >= count) ? (raised - count) : raised;
+    int left_2 = static_cast<int>(hash - (static_cast<uint>(psao_naga_f2i32(static_cast<float>(static_cast<int>(hash >> 1u)) * (inverse * 1.999998))) * count));
+    int divisor = static_cast<int>(count);
+    int rest = as_type<int>(as_type<uint>(left_2) - as_type<uint>(as_type<int>(as_type<uint>(psao_naga_f2i32(static_cast<float>(left_2) * inverse)) * as_type<uint>(divisor))));
+    int raised = (rest < 0) ? as_type<int>(as_type<uint>(rest) + as_type<uint>(divisor)) : rest;
+    int whole = (raised >= divisor) ? as_type<int>(as_type<uint>(raised) - as_type<uint>(divisor)) : raised;
+    return (count == 1u) ? 0u : static_cast<uint>(whole);
 }
 
 uint psao_lowest(
@@ -520,8 +543,6 @@ PsaoCandidate psao_candidate(
     uint bucket_1,
     device PsaoWords const& psao_buckets
 ) {
-    bool local_4 = {};
-    bool local_5 = {};
     if (!(there)) {
         return PsaoCandidate {0u, 0u};
     }
@@ -529,18 +550,7 @@ PsaoCandidate psao_candidate(
     uint _e10 = psao_tag(key_2);
     uint _e11 = psao_pick(_e9, _e10);
     bool here = _e11 <= PSAO_ENTRY_CELL;
-    if (!(here)) {
-        local_4 = _e9.w != 0u;
-    } else {
-        local_4 = false;
-    }
-    bool _e21 = local_4;
-    if (!(_e21)) {
-        local_5 = (_e9.x - 1u) < PSAO_ENTRY_CELL;
-    } else {
-        local_5 = true;
-    }
-    bool unsure = local_5;
+    bool unsure = (_e9.x - 1u) < PSAO_ENTRY_CELL;
     return PsaoCandidate {here ? _e11 : 0u, unsure ? 1u : 0u};
 }
 
@@ -560,49 +570,28 @@ PsaoPair psao_pair(
     return PsaoPair {metal::uint2(_e18.cell, _e22.cell), _e18.unsure | (_e22.unsure << 1u)};
 }
 
-PsaoBlock psao_block(
+uint psao_within(
     PsaoGrid grid_5,
+    metal::uint3 base_1
+) {
+    metal::uint3 low = static_cast<metal::uint3>(base_1 < grid_5.dims) * metal::uint3(85u, 51u, 15u);
+    metal::uint3 high = static_cast<metal::uint3>((base_1 + metal::uint3(1u)) < grid_5.dims) * metal::uint3(170u, 204u, 240u);
+    metal::uint3 axes = low | high;
+    return (axes.x & axes.y) & axes.z;
+}
+
+PsaoBlock psao_block(
     PsaoTable table_3,
-    metal::uint3 base_1,
-    bool live,
+    uint corners,
     device PsaoWords const& psao_buckets
 ) {
-    bool local_6 = {};
-    bool local_7 = {};
-    bool local_8 = {};
-    bool local_9 = {};
-    metal::bool3 low = (base_1 < grid_5.dims) & metal::bool3(live);
-    metal::bool3 high = ((base_1 + metal::uint3(1u)) < grid_5.dims) & metal::bool3(live);
-    metal::bool2 x = metal::bool2(low.x, high.x);
-    if (low.y) {
-        local_6 = low.z;
-    } else {
-        local_6 = false;
-    }
-    bool _e23 = local_6;
-    PsaoPair _e29 = psao_pair(table_3, x & metal::bool2(_e23), metal::uint2(0u, 0u), psao_buckets);
-    if (high.y) {
-        local_7 = low.z;
-    } else {
-        local_7 = false;
-    }
-    bool _e35 = local_7;
-    PsaoPair _e41 = psao_pair(table_3, x & metal::bool2(_e35), metal::uint2(1u, 0u), psao_buckets);
-    if (low.y) {
-        local_8 = high.z;
-    } else {
-        local_8 = false;
-    }
-    bool _e47 = local_8;
-    PsaoPair _e53 = psao_pair(table_3, x & metal::bool2(_e47), metal::uint2(0u, 1u), psao_buckets);
-    if (high.y) {
-        local_9 = high.z;
-    } else {
-        local_9 = false;
-    }
-    bool _e59 = local_9;
-    PsaoPair _e65 = psao_pair(table_3, x & metal::bool2(_e59), metal::uint2(1u, 1u), psao_buckets);
-    return PsaoBlock {metal::uint4(_e29.cells, _e41.cells), metal::uint4(_e53.cells, _e65.cells), ((_e29.unsure | (_e41.unsure << 2u)) | (_e53.unsure << 4u)) | (_e65.unsure << 6u)};
+    metal::bool4 low_1 = (metal::uint4(corners) & metal::uint4(1u, 2u, 4u, 8u)) != metal::uint4(0u);
+    metal::bool4 high_1 = (metal::uint4(corners) & metal::uint4(16u, 32u, 64u, 128u)) != metal::uint4(0u);
+    PsaoPair _e26 = psao_pair(table_3, low_1.xy, metal::uint2(0u, 0u), psao_buckets);
+    PsaoPair _e31 = psao_pair(table_3, low_1.zw, metal::uint2(1u, 0u), psao_buckets);
+    PsaoPair _e36 = psao_pair(table_3, high_1.xy, metal::uint2(0u, 1u), psao_buckets);
+    PsaoPair _e41 = psao_pair(table_3, high_1.zw, metal::uint2(1u, 1u), psao_buckets);
+    return PsaoBlock {metal::uint4(_e26.cells, _e31.cells), metal::uint4(_e36.cells, _e41.cells), ((_e26.unsure | (_e31.unsure << 2u)) | (_e36.unsure << 4u)) | (_e41.unsure << 6u)};
 }
 
 PsaoBlock psao_with(
@@ -612,8 +601,8 @@ PsaoBlock psao_with(
 ) {
     metal::bool4 here_1 = metal::uint4(0u, 1u, 2u, 3u) == metal::uint4(corner_2 & 3u);
     metal::uint4 cells = static_cast<metal::uint4>(here_1) * cell_2;
-    metal::uint4 high_1 = metal::uint4((corner_2 >= 4u) ? 4294967295u : 0u);
-    return PsaoBlock {block.lower | (cells & ~(high_1)), block.upper | (cells & high_1), block.unsure};
+    metal::uint4 high_2 = metal::uint4((corner_2 >= 4u) ? 4294967295u : 0u);
+    return PsaoBlock {block.lower | (cells & ~(high_2)), block.upper | (cells & high_2), block.unsure};
 }
 
 uint psao_corners(
@@ -633,31 +622,70 @@ uint psao_cell_at(
     return (offset_3.z != 0u) ? upper : lower_1;
 }
 
+PsaoPeek psao_peek(
+    bool wanted,
+    uint bucket_2,
+    uint key_3,
+    uint entry,
+    device PsaoWords const& psao_buckets,
+    device PsaoWords const& psao_cells
+) {
+    bool local_4 = {};
+    bool local_5 = {};
+    bool local_6 = {};
+    if (!(wanted)) {
+        return PsaoPeek {0u, true};
+    }
+    metal::uint4 _e13 = psao_load_bucket((bucket_2 * 2u) + (entry >> 2u), psao_buckets);
+    uint cell_5 = _e13[entry & 3u] & PSAO_ENTRY_CELL;
+    if (cell_5 != 0u) {
+        metal::uint4 _e25 = psao_load_cell(cell_5 * 2u, psao_cells);
+        local_4 = _e25.x == key_3;
+    } else {
+        local_4 = false;
+    }
+    bool here_2 = local_4;
+    if (!(here_2)) {
+        local_5 = cell_5 == 0u;
+    } else {
+        local_5 = true;
+    }
+    bool _e38 = local_5;
+    if (!(_e38)) {
+        local_6 = entry == 7u;
+    } else {
+        local_6 = true;
+    }
+    bool _e45 = local_6;
+    return PsaoPeek {here_2 ? cell_5 : 0u, _e45};
+}
+
 PsaoRound psao_round(
     uint cell_3,
-    uint key_3,
+    uint key_4,
     uint round,
     device PsaoWords const& psao_cells
 ) {
-    bool local_10 = {};
+    bool local_7 = {};
     metal::uint4 _e8 = psao_load_cell((cell_3 * 2u) + metal::min(round, 1u), psao_cells);
-    uint first = (round == 0u) ? ((_e8.x == key_3) ? _e8.y : 0u) : _e8.x;
-    uint a_1 = (round == 2u) ? _e8.w : first;
-    if (!((a_1 == 0u))) {
-        local_10 = round == 2u;
+    uint first = (round == 0u) ? ((_e8.x == key_4) ? _e8.y : 0u) : _e8.x;
+    uint a_3 = (round == 2u) ? _e8.w : first;
+    if (!((a_3 == 0u))) {
+        local_7 = round == 2u;
     } else {
-        local_10 = true;
+        local_7 = true;
     }
-    bool _e36 = local_10;
-    uint b_1 = _e36 ? 0u : ((round == 0u) ? _e8.z : _e8.y);
-    uint c = (b_1 == 0u) ? 0u : ((round == 0u) ? _e8.w : _e8.z);
-    return PsaoRound {metal::uint3(a_1, b_1, c), c != 0u};
+    bool _e36 = local_7;
+    uint b_3 = _e36 ? 0u : ((round == 0u) ? _e8.z : _e8.y);
+    uint c = (b_3 == 0u) ? 0u : ((round == 0u) ? _e8.w : _e8.z);
+    return PsaoRound {metal::uint3(a_3, b_3, c), c != 0u};
 }
 
 float psao_share(
     metal::float3 place_1
 ) {
-    metal::float3 sides_1 = metal::clamp((metal::float3(1.0) - metal::abs(place_1 - metal::float3(0.5))) / metal::float3(0.3), metal::float3(0.0), metal::float3(1.0));
+    metal::float3 inside_1 = metal::float3(1.0) - metal::abs(place_1 - metal::float3(0.484375));
+    metal::float3 sides_1 = metal::clamp(inside_1 * 3.3333333, metal::float3(0.0), metal::float3(1.0));
     return (sides_1.x * sides_1.y) * sides_1.z;
 }
 
@@ -673,142 +701,158 @@ PsaoPoint psao_point(
     metal::float3 m = metal::float3(uv_1 - metal::select(metal::float2(fold), metal::float2(-(fold)), uv_1 < metal::float2(0.0)), z_1);
     float openness_2 = static_cast<float>(static_cast<int>(point_3 & 255u));
     float lit_1 = metal::min(openness_2 * 0.019607844, 1.0);
-    float seen_1 = metal::fma(lit_1, lit_1, PSAO_UNSEEN);
-    return PsaoPoint {static_cast<metal::float3>(steps_1) * scale, m, metal::fma(m.x, m.x, metal::fma(m.y, m.y, m.z * m.z)), openness_2, (static_cast<int>(point_3) >= 0) ? 0.0 : seen_1};
+    float seen_2 = metal::fma(lit_1, lit_1, PSAO_UNSEEN);
+    return PsaoPoint {static_cast<metal::float3>(steps_1) * scale, m, metal::fma(m.x, m.x, metal::fma(m.y, m.y, m.z * m.z)), openness_2, (static_cast<int>(point_3) >= 0) ? 0.0 : seen_2};
 }
 
-float psao_dot(
+PsaoTwo psao_two(
     metal::float3 a,
     metal::float3 b
 ) {
-    return metal::fma(a.x, b.x, metal::fma(a.y, b.y, a.z * b.z));
+    return PsaoTwo {metal::float2(a.x, b.x), metal::float2(a.y, b.y), metal::float2(a.z, b.z)};
 }
 
-metal::float2 psao_add(
-    metal::float2 sums,
-    float inverse_radius2_,
-    metal::float3 normal_7,
-    metal::float3 place_2,
-    float share,
+metal::float2 psao_dot_two(
+    PsaoTwo a_1,
+    PsaoTwo b_1
+) {
+    return metal::fma(a_1.x, b_1.x, metal::fma(a_1.y, b_1.y, a_1.z * b_1.z));
+}
+
+metal::float2 psao_dot_each(
+    PsaoTwo a_2,
+    metal::float3 b_2
+) {
+    return metal::fma(a_2.x, metal::float2(b_2.x), metal::fma(a_2.y, metal::float2(b_2.y), a_2.z * b_2.z));
+}
+
+PsaoSums psao_add(
+    PsaoSums sums,
+    PsaoSeen seen,
     uint word
 ) {
-    PsaoPoint _e6 = psao_point(word);
-    metal::float3 d_3 = _e6.place - place_2;
-    float _e10 = psao_dot(_e6.normal, normal_7);
-    float agree_1 = metal::max(_e10, 0.0);
-    float agree2_1 = metal::max(agree_1 * agree_1, 0.010000001 * _e6.square);
-    float _e18 = psao_dot(normal_7, d_3);
-    float _e20 = psao_dot(_e6.normal, d_3);
-    float h2_ = metal::max((_e18 * _e18) * _e6.square, _e20 * _e20);
-    float _e26 = psao_dot(d_3, d_3);
-    float in_reach_1 = metal::max(metal::fma(_e26, inverse_radius2_ * -0.8333333, 1.0), PSAO_BEYOND);
-    float near = metal::fma(_e26, inverse_radius2_, PSAO_CORE) * _e6.square;
-    float apart_1 = metal::fma(h2_, PSAO_FLATNESS * inverse_radius2_, near);
-    float ratio = (agree2_1 * agree2_1) / (apart_1 * _e6.square);
-    float weight_1 = ((share * _e6.seen) * in_reach_1) * (ratio * ratio);
-    return metal::fma(metal::float2(weight_1), metal::float2(1.0, _e6.openness), sums);
+    PsaoPoint _e3 = psao_point(word);
+    metal::float3 p = _e3.place;
+    PsaoTwo d_3 = PsaoTwo {metal::float2(_e3.place.x) - seen.place.x, metal::float2(_e3.place.y) - seen.place.y, metal::float2(_e3.place.z) - seen.place.z};
+    metal::float2 _e23 = psao_dot_each(seen.normal, _e3.normal);
+    metal::float2 agree_1 = metal::max(_e23, metal::float2(0.0));
+    metal::float2 agree2_1 = metal::max(agree_1 * agree_1, metal::float2(0.010000001 * _e3.square));
+    metal::float2 _e34 = psao_dot_two(seen.normal, d_3);
+    metal::float2 _e36 = psao_dot_each(d_3, _e3.normal);
+    metal::float2 h2_ = metal::max((_e34 * _e34) * _e3.square, _e36 * _e36);
+    metal::float2 _e42 = psao_dot_two(d_3, d_3);
+    metal::float2 to_reach = seen.inverse_radius2_ * -0.8333333;
+    metal::float2 in_reach_1 = metal::max(metal::fma(_e42, to_reach, metal::float2(1.0)), metal::float2(0.001));
+    metal::float2 near = metal::fma(_e42, seen.inverse_radius2_, metal::float2(0.5)) * _e3.square;
+    metal::float2 apart_1 = metal::fma(h2_, PSAO_FLATNESS * seen.inverse_radius2_, near) * _e3.square;
+    metal::float2 ratio = (agree2_1 * agree2_1) / apart_1;
+    metal::float2 weight_1 = ((seen.share * _e3.seen) * in_reach_1) * (ratio * ratio);
+    return PsaoSums {sums.weights + weight_1, metal::fma(weight_1, metal::float2(_e3.openness), sums.openness)};
 }
 
 metal::float2 psao_blend_fast(
     uint instance_6,
     metal::float3 position_5,
-    metal::float3 normal_8,
+    metal::float3 normal_7,
     device PsaoWords const& psao_instances,
     device PsaoWords const& psao_buckets,
     device PsaoWords const& psao_cells
 ) {
     PsaoBlock block_3 = {};
+    uint entry_1 = 0u;
     uint left = {};
-    metal::float2 sums_1 = metal::float2(0.0);
+    PsaoSums sums_1 = PsaoSums {metal::float2(0.0), metal::float2(0.0)};
     uint round_1 = 0u;
     PsaoGrid _e3 = psao_grid_fast(instance_6, psao_instances);
-    PsaoFragment _e4 = psao_fragment(_e3, position_5, normal_8);
+    PsaoFragment _e4 = psao_fragment(_e3, position_5, normal_7);
     if (_e4.outside) {
         return metal::float2(1.0, 0.0);
     }
     metal::uint3 base_2 = static_cast<metal::uint3>(_e4.base);
     PsaoTable _e11 = psao_table(_e3, base_2);
-    PsaoBlock _e13 = psao_block(_e3, _e11, base_2, true, psao_buckets);
+    uint _e12 = psao_within(_e3, base_2);
+    PsaoBlock _e13 = psao_block(_e11, _e12, psao_buckets);
     block_3 = _e13;
     while(true) {
-        uint _e16 = block_3.unsure;
-        if (_e16 != 0u) {
-        } else {
+        uint _e18 = block_3.unsure;
+        uint _e19 = psao_lowest(_e18);
+        metal::uint3 _e20 = psao_corner(_e19);
+        uint _e21 = psao_key(_e11, _e20);
+        uint _e23 = block_3.unsure;
+        uint _e26 = psao_bucket(_e11, _e20);
+        uint _e27 = entry_1;
+        PsaoPeek _e28 = psao_peek(_e23 != 0u, _e26, _e21, _e27, psao_buckets, psao_cells);
+        PsaoBlock _e29 = block_3;
+        PsaoBlock _e31 = psao_with(_e29, _e19, _e28.cell);
+        block_3 = _e31;
+        uint _e33 = block_3.unsure;
+        uint _e36 = block_3.unsure;
+        block_3.unsure = _e33 & (_e28.last ? (_e36 - 1u) : 4294967295u);
+        uint _e42 = entry_1;
+        entry_1 = _e28.last ? 0u : (_e42 + 1u);
+        uint _e49 = block_3.unsure;
+        if (_e49 == 0u) {
             break;
         }
-        {
-            uint _e20 = block_3.unsure;
-            uint _e21 = psao_lowest(_e20);
-            metal::uint3 _e22 = psao_corner(_e21);
-            uint _e23 = psao_bucket(_e11, _e22);
-            uint _e24 = psao_key(_e11, _e22);
-            uint _e25 = psao_search(_e23, _e24, psao_buckets, psao_cells);
-            PsaoBlock _e26 = block_3;
-            PsaoBlock _e27 = psao_with(_e26, _e21, _e25);
-            block_3 = _e27;
-            uint _e29 = block_3.unsure;
-            uint _e31 = block_3.unsure;
-            block_3.unsure = _e29 & (_e31 - 1u);
-        }
     }
-    PsaoBlock _e35 = block_3;
-    uint _e36 = psao_corners(_e35);
-    left = _e36;
-    float inverse_radius2_1 = 1.0 / (_e3.radius * _e3.radius);
+    PsaoBlock _e52 = block_3;
+    uint _e53 = psao_corners(_e52);
+    left = _e53;
+    metal::float3 start = _e4.place - metal::float3(0.015625);
+    float inverse_radius2_ = 1.0 / (_e3.radius * _e3.radius);
     while(true) {
-        uint _e48 = left;
-        if (_e48 != 0u) {
-        } else {
+        uint _e72 = left;
+        uint _e73 = psao_lowest(_e72);
+        metal::uint3 _e74 = psao_corner(_e73);
+        PsaoBlock _e75 = block_3;
+        uint _e76 = psao_cell_at(_e75, _e74);
+        uint _e77 = psao_key(_e11, _e74);
+        uint _e78 = round_1;
+        PsaoRound _e79 = psao_round(_e76, _e77, _e78, psao_cells);
+        metal::float3 place_2 = start - static_cast<metal::float3>(static_cast<metal::int3>(_e74));
+        PsaoTwo _e86 = psao_two(_e4.normal, metal::float3(0.0));
+        PsaoTwo _e89 = psao_two(place_2, metal::float3(0.0));
+        float _e92 = psao_share(place_2);
+        PsaoSeen seen_3 = PsaoSeen {_e86, _e89, metal::float2(inverse_radius2_, 0.0), metal::float2(_e92, 0.0)};
+        PsaoSums _e96 = sums_1;
+        PsaoSums _e99 = psao_add(_e96, seen_3, _e79.points[0]);
+        sums_1 = _e99;
+        PsaoSums _e100 = sums_1;
+        PsaoSums _e103 = psao_add(_e100, seen_3, _e79.points[1]);
+        sums_1 = _e103;
+        PsaoSums _e104 = sums_1;
+        PsaoSums _e107 = psao_add(_e104, seen_3, _e79.points[2]);
+        sums_1 = _e107;
+        uint _e109 = round_1;
+        round_1 = _e79.more ? (_e109 + 1u) : 0u;
+        uint _e114 = left;
+        uint _e115 = left;
+        uint _e119 = left;
+        left = _e79.more ? _e119 : (_e114 & (_e115 - 1u));
+        uint _e122 = left;
+        if (_e122 == 0u) {
             break;
         }
-        {
-            uint _e51 = left;
-            uint _e52 = psao_lowest(_e51);
-            metal::uint3 _e53 = psao_corner(_e52);
-            PsaoBlock _e54 = block_3;
-            uint _e55 = psao_cell_at(_e54, _e53);
-            uint _e56 = psao_key(_e11, _e53);
-            uint _e57 = round_1;
-            PsaoRound _e58 = psao_round(_e55, _e56, _e57, psao_cells);
-            metal::float3 at = _e4.place - static_cast<metal::float3>(static_cast<metal::int3>(_e53));
-            float _e63 = psao_share(at);
-            metal::float3 place_3 = at - metal::float3(0.015625);
-            metal::float2 _e67 = sums_1;
-            metal::float2 _e71 = psao_add(_e67, inverse_radius2_1, _e4.normal, place_3, _e63, _e58.points[0]);
-            sums_1 = _e71;
-            metal::float2 _e72 = sums_1;
-            metal::float2 _e76 = psao_add(_e72, inverse_radius2_1, _e4.normal, place_3, _e63, _e58.points[1]);
-            sums_1 = _e76;
-            metal::float2 _e77 = sums_1;
-            metal::float2 _e81 = psao_add(_e77, inverse_radius2_1, _e4.normal, place_3, _e63, _e58.points[2]);
-            sums_1 = _e81;
-            uint _e83 = round_1;
-            round_1 = _e58.more ? (_e83 + 1u) : 0u;
-            uint _e88 = left;
-            uint _e89 = left;
-            uint _e93 = left;
-            left = _e58.more ? _e93 : (_e88 & (_e89 - 1u));
-        }
     }
-    float _e97 = sums_1.y;
-    float _e99 = sums_1.x;
-    float openness_3 = metal::min((_e97 / _e99) * 0.003921569, 1.0);
-    float _e106 = sums_1.x;
-    float _e108 = psao_seen(openness_3);
-    float near_1 = metal::min(_e106 / (PSAO_NEAR * _e108), 1.0);
-    float _e118 = sums_1.x;
-    return (_e118 > 0.0) ? metal::float2(openness_3, near_1) : metal::float2(1.0, 0.0);
+    float _e127 = sums_1.openness.x;
+    float _e130 = sums_1.weights.x;
+    float openness_3 = metal::min((_e127 / _e130) * 0.003921569, 1.0);
+    float _e138 = sums_1.weights.x;
+    float _e140 = psao_seen(openness_3);
+    float near_1 = metal::min(_e138 / (PSAO_NEAR * _e140), 1.0);
+    float _e151 = sums_1.weights.x;
+    return (_e151 > 0.0) ? metal::float2(openness_3, near_1) : metal::float2(1.0, 0.0);
 }
 
 float psao_planar_fast(
     uint instance_7,
     metal::float3 position_6,
-    metal::float3 normal_9,
+    metal::float3 normal_8,
     device PsaoWords const& psao_instances,
     device PsaoWords const& psao_buckets,
     device PsaoWords const& psao_cells
 ) {
-    metal::float2 _e3 = psao_blend_fast(instance_7, position_6, normal_9, psao_instances, psao_buckets, psao_cells);
+    metal::float2 _e3 = psao_blend_fast(instance_7, position_6, normal_8, psao_instances, psao_buckets, psao_cells);
     return _e3.x;
 }
 
@@ -816,25 +860,25 @@ float psao_over_baked(
     uint kernel_,
     uint instance_8,
     metal::float3 position_7,
-    metal::float3 normal_10,
+    metal::float3 normal_9,
     float baked,
-    float share_1,
+    float share,
     device PsaoWords const& psao_instances,
     device PsaoWords const& psao_buckets,
     device PsaoWords const& psao_cells
 ) {
     metal::float2 found = metal::float2(1.0, 0.0);
-    if (share_1 <= 0.0) {
+    if (share <= 0.0) {
         return baked;
     }
     if (kernel_ == PSAO_PAPER) {
-        metal::float2 _e15 = psao_blend(false, instance_8, position_7, normal_10, psao_instances, psao_buckets, psao_cells);
+        metal::float2 _e15 = psao_blend(false, instance_8, position_7, normal_9, psao_instances, psao_buckets, psao_cells);
         found = _e15;
     } else {
-        metal::float2 _e16 = psao_blend_fast(instance_8, position_7, normal_10, psao_instances, psao_buckets, psao_cells);
+        metal::float2 _e16 = psao_blend_fast(instance_8, position_7, normal_9, psao_instances, psao_buckets, psao_cells);
         found = _e16;
     }
     float _e18 = found.x;
     float _e20 = found.y;
-    return metal::mix(baked, _e18, _e20 * metal::min(share_1, 1.0));
+    return metal::mix(baked, _e18, _e20 * metal::min(share, 1.0));
 }

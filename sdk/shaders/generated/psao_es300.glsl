@@ -62,6 +62,10 @@ struct PsaoBlock {
     uvec4 upper;
     uint unsure;
 };
+struct PsaoPeek {
+    uint cell;
+    bool last;
+};
 struct PsaoRound {
     uvec3 points;
     bool more;
@@ -72,6 +76,21 @@ struct PsaoPoint {
     float square;
     float openness;
     float seen;
+};
+struct PsaoTwo {
+    vec2 x;
+    vec2 y;
+    vec2 z;
+};
+struct PsaoSums {
+    vec2 weights;
+    vec2 openness;
+};
+struct PsaoSeen {
+    PsaoTwo normal;
+    PsaoTwo place;
+    vec2 inverse_radius2_;
+    vec2 share;
 };
 const float PSAO_T_N = 0.1;
 const float PSAO_T_D = 0.7;
@@ -85,6 +104,7 @@ const float PSAO_UNSEEN = 0.0001;
 const float PSAO_NEAR = 0.05;
 const uint PSAO_PAPER = 0u;
 const uint PSAO_ENTRY_CELL = 4194303u;
+const float PSAO_HALF_STEP = 0.015625;
 
 uniform highp usampler2D psao_instances;
 
@@ -167,13 +187,13 @@ uint psao_search(uint bucket, uint key) {
             uint _e9 = i;
             uvec4 _e13 = psao_load_bucket(((bucket * 2u) + (_e9 >> 2u)));
             uint _e14 = i;
-            uint entry = (_e13[(_e14 & 3u)] & PSAO_ENTRY_CELL);
-            if ((entry == 0u)) {
+            uint entry_2 = (_e13[(_e14 & 3u)] & PSAO_ENTRY_CELL);
+            if ((entry_2 == 0u)) {
                 break;
             }
-            uvec4 _e24 = psao_load_cell((entry * 2u));
+            uvec4 _e24 = psao_load_cell((entry_2 * 2u));
             if ((_e24.x == key)) {
-                return entry;
+                return entry_2;
             }
         }
     }
@@ -182,9 +202,9 @@ uint psao_search(uint bucket, uint key) {
 
 uint psao_find(PsaoGrid grid_2, uvec3 cell_1) {
     uint _e5 = psao_weigh(grid_2, cell_1, 17u, 31u);
-    uint bucket_2 = (grid_2.bucket_first + (_e5 % grid_2.bucket_count));
+    uint bucket_3 = (grid_2.bucket_first + (_e5 % grid_2.bucket_count));
     uint _e11 = psao_weigh(grid_2, cell_1, 1u, 1u);
-    uint _e12 = psao_search(bucket_2, _e11);
+    uint _e12 = psao_search(bucket_3, _e11);
     return _e12;
 }
 
@@ -341,9 +361,9 @@ vec2 psao_blend(bool planar, uint instance_2, vec3 position_2, vec3 normal_4) {
         float _e96 = weights;
         float openness_1 = min((_e95 / _e96), 1.0);
         float _e100 = psao_seen(openness_1);
-        float seen = (planar ? _e100 : 1.0);
+        float seen_1 = (planar ? _e100 : 1.0);
         float _e103 = weights;
-        return vec2(openness_1, min((_e103 / (PSAO_NEAR * seen)), 1.0));
+        return vec2(openness_1, min((_e103 / (PSAO_NEAR * seen_1)), 1.0));
     }
     return vec2(1.0, 0.0);
 }
@@ -363,10 +383,12 @@ uint psao_tag(uint key_1) {
 }
 
 uint psao_modulo(uint hash, uint count, float inverse_) {
-    uint left_2 = (hash - (uint(((float(hash) * inverse_) * 0.999999)) * count));
-    uint rest = (left_2 - (uint((float(left_2) * inverse_)) * count));
-    uint raised = ((rest >= 2147483648u) ? (rest + count) : rest);
-    return ((raised >= count) ? (raised - count) : raised);
+    int left_2 = int((hash - (uint(int((float(int((hash >> 1u))) * (inverse_ * 1.999998)))) * count)));
+    int divisor = int(count);
+    int rest = (left_2 - (int((float(left_2) * inverse_)) * divisor));
+    int raised = ((rest < 0) ? (rest + divisor) : rest);
+    int whole = ((raised >= divisor) ? (raised - divisor) : raised);
+    return ((count == 1u) ? 0u : uint(whole));
 }
 
 uint psao_lowest(uint bits) {
@@ -410,8 +432,6 @@ uint psao_pick(uvec4 entries, uint tag) {
 }
 
 PsaoCandidate psao_candidate(bool there, uint key_2, uint bucket_1) {
-    bool local_4 = false;
-    bool local_5 = false;
     if (!(there)) {
         return PsaoCandidate(0u, 0u);
     }
@@ -419,18 +439,7 @@ PsaoCandidate psao_candidate(bool there, uint key_2, uint bucket_1) {
     uint _e10 = psao_tag(key_2);
     uint _e11 = psao_pick(_e9, _e10);
     bool here = (_e11 <= PSAO_ENTRY_CELL);
-    if (!(here)) {
-        local_4 = (_e9.w != 0u);
-    } else {
-        local_4 = false;
-    }
-    bool _e21 = local_4;
-    if (!(_e21)) {
-        local_5 = ((_e9.x - 1u) < PSAO_ENTRY_CELL);
-    } else {
-        local_5 = true;
-    }
-    bool unsure = local_5;
+    bool unsure = ((_e9.x - 1u) < PSAO_ENTRY_CELL);
     return PsaoCandidate((here ? _e11 : 0u), (unsure ? 1u : 0u));
 }
 
@@ -445,50 +454,28 @@ PsaoPair psao_pair(PsaoTable table_2, bvec2 there_1, uvec2 row) {
     return PsaoPair(uvec2(_e18.cell, _e22.cell), (_e18.unsure | (_e22.unsure << 1u)));
 }
 
-PsaoBlock psao_block(PsaoGrid grid_5, PsaoTable table_3, uvec3 base_1, bool live) {
-    bool local_6 = false;
-    bool local_7 = false;
-    bool local_8 = false;
-    bool local_9 = false;
-    bvec3 low = bvec3(lessThan(base_1, grid_5.dims).x && bvec3(live).x, lessThan(base_1, grid_5.dims).y && bvec3(live).y, lessThan(base_1, grid_5.dims).z && bvec3(live).z);
-    bvec3 high = bvec3(lessThan((base_1 + uvec3(1u)), grid_5.dims).x && bvec3(live).x, lessThan((base_1 + uvec3(1u)), grid_5.dims).y && bvec3(live).y, lessThan((base_1 + uvec3(1u)), grid_5.dims).z && bvec3(live).z);
-    bvec2 x = bvec2(low.x, high.x);
-    if (low.y) {
-        local_6 = low.z;
-    } else {
-        local_6 = false;
-    }
-    bool _e23 = local_6;
-    PsaoPair _e29 = psao_pair(table_3, bvec2(x.x && bvec2(_e23).x, x.y && bvec2(_e23).y), uvec2(0u, 0u));
-    if (high.y) {
-        local_7 = low.z;
-    } else {
-        local_7 = false;
-    }
-    bool _e35 = local_7;
-    PsaoPair _e41 = psao_pair(table_3, bvec2(x.x && bvec2(_e35).x, x.y && bvec2(_e35).y), uvec2(1u, 0u));
-    if (low.y) {
-        local_8 = high.z;
-    } else {
-        local_8 = false;
-    }
-    bool _e47 = local_8;
-    PsaoPair _e53 = psao_pair(table_3, bvec2(x.x && bvec2(_e47).x, x.y && bvec2(_e47).y), uvec2(0u, 1u));
-    if (high.y) {
-        local_9 = high.z;
-    } else {
-        local_9 = false;
-    }
-    bool _e59 = local_9;
-    PsaoPair _e65 = psao_pair(table_3, bvec2(x.x && bvec2(_e59).x, x.y && bvec2(_e59).y), uvec2(1u, 1u));
-    return PsaoBlock(uvec4(_e29.cells, _e41.cells), uvec4(_e53.cells, _e65.cells), (((_e29.unsure | (_e41.unsure << 2u)) | (_e53.unsure << 4u)) | (_e65.unsure << 6u)));
+uint psao_within(PsaoGrid grid_5, uvec3 base_1) {
+    uvec3 low = (uvec3(lessThan(base_1, grid_5.dims)) * uvec3(85u, 51u, 15u));
+    uvec3 high = (uvec3(lessThan((base_1 + uvec3(1u)), grid_5.dims)) * uvec3(170u, 204u, 240u));
+    uvec3 axes = (low | high);
+    return ((axes.x & axes.y) & axes.z);
+}
+
+PsaoBlock psao_block(PsaoTable table_3, uint corners) {
+    bvec4 low_1 = notEqual((uvec4(corners) & uvec4(1u, 2u, 4u, 8u)), uvec4(0u));
+    bvec4 high_1 = notEqual((uvec4(corners) & uvec4(16u, 32u, 64u, 128u)), uvec4(0u));
+    PsaoPair _e26 = psao_pair(table_3, low_1.xy, uvec2(0u, 0u));
+    PsaoPair _e31 = psao_pair(table_3, low_1.zw, uvec2(1u, 0u));
+    PsaoPair _e36 = psao_pair(table_3, high_1.xy, uvec2(0u, 1u));
+    PsaoPair _e41 = psao_pair(table_3, high_1.zw, uvec2(1u, 1u));
+    return PsaoBlock(uvec4(_e26.cells, _e31.cells), uvec4(_e36.cells, _e41.cells), (((_e26.unsure | (_e31.unsure << 2u)) | (_e36.unsure << 4u)) | (_e41.unsure << 6u)));
 }
 
 PsaoBlock psao_with(PsaoBlock block, uint corner_2, uint cell_2) {
     bvec4 here_1 = equal(uvec4(0u, 1u, 2u, 3u), uvec4((corner_2 & 3u)));
     uvec4 cells = (uvec4(here_1) * cell_2);
-    uvec4 high_1 = uvec4(((corner_2 >= 4u) ? 4294967295u : 0u));
-    return PsaoBlock((block.lower | (cells & ~(high_1))), (block.upper | (cells & high_1)), block.unsure);
+    uvec4 high_2 = uvec4(((corner_2 >= 4u) ? 4294967295u : 0u));
+    return PsaoBlock((block.lower | (cells & ~(high_2))), (block.upper | (cells & high_2)), block.unsure);
 }
 
 uint psao_corners(PsaoBlock block_1) {
@@ -503,24 +490,56 @@ uint psao_cell_at(PsaoBlock block_2, uvec3 offset_3) {
     return ((offset_3.z != 0u) ? upper : lower_1);
 }
 
-PsaoRound psao_round(uint cell_3, uint key_3, uint round_) {
-    bool local_10 = false;
-    uvec4 _e8 = psao_load_cell(((cell_3 * 2u) + min(round_, 1u)));
-    uint first = ((round_ == 0u) ? ((_e8.x == key_3) ? _e8.y : 0u) : _e8.x);
-    uint a_1 = ((round_ == 2u) ? _e8.w : first);
-    if (!((a_1 == 0u))) {
-        local_10 = (round_ == 2u);
-    } else {
-        local_10 = true;
+PsaoPeek psao_peek(bool wanted, uint bucket_2, uint key_3, uint entry) {
+    bool local_4 = false;
+    bool local_5 = false;
+    bool local_6 = false;
+    if (!(wanted)) {
+        return PsaoPeek(0u, true);
     }
-    bool _e36 = local_10;
-    uint b_1 = (_e36 ? 0u : ((round_ == 0u) ? _e8.z : _e8.y));
-    uint c = ((b_1 == 0u) ? 0u : ((round_ == 0u) ? _e8.w : _e8.z));
-    return PsaoRound(uvec3(a_1, b_1, c), (c != 0u));
+    uvec4 _e13 = psao_load_bucket(((bucket_2 * 2u) + (entry >> 2u)));
+    uint cell_5 = (_e13[(entry & 3u)] & PSAO_ENTRY_CELL);
+    if ((cell_5 != 0u)) {
+        uvec4 _e25 = psao_load_cell((cell_5 * 2u));
+        local_4 = (_e25.x == key_3);
+    } else {
+        local_4 = false;
+    }
+    bool here_2 = local_4;
+    if (!(here_2)) {
+        local_5 = (cell_5 == 0u);
+    } else {
+        local_5 = true;
+    }
+    bool _e38 = local_5;
+    if (!(_e38)) {
+        local_6 = (entry == 7u);
+    } else {
+        local_6 = true;
+    }
+    bool _e45 = local_6;
+    return PsaoPeek((here_2 ? cell_5 : 0u), _e45);
+}
+
+PsaoRound psao_round(uint cell_3, uint key_4, uint round_) {
+    bool local_7 = false;
+    uvec4 _e8 = psao_load_cell(((cell_3 * 2u) + min(round_, 1u)));
+    uint first = ((round_ == 0u) ? ((_e8.x == key_4) ? _e8.y : 0u) : _e8.x);
+    uint a_3 = ((round_ == 2u) ? _e8.w : first);
+    if (!((a_3 == 0u))) {
+        local_7 = (round_ == 2u);
+    } else {
+        local_7 = true;
+    }
+    bool _e36 = local_7;
+    uint b_3 = (_e36 ? 0u : ((round_ == 0u) ? _e8.z : _e8.y));
+    uint c = ((b_3 == 0u) ? 0u : ((round_ == 0u) ? _e8.w : _e8.z));
+    return PsaoRound(uvec3(a_3, b_3, c), (c != 0u));
 }
 
 float psao_share(vec3 place_1) {
-    vec3 sides_1 = clamp(((vec3(1.0) - abs((place_1 - vec3(0.5)))) / vec3(0.3)), vec3(0.0), vec3(1.0));
+    vec3 inside_1 = (vec3(1.0) - abs((place_1 - vec3(0.484375))));
+    vec3 sides_1 = clamp((inside_1 * 3.3333333), vec3(0.0), vec3(1.0));
     return ((sides_1.x * sides_1.y) * sides_1.z);
 }
 
@@ -534,134 +553,147 @@ PsaoPoint psao_point(uint point_3) {
     vec3 m = vec3((uv_1 - mix(vec2(fold), vec2(-(fold)), lessThan(uv_1, vec2(0.0)))), z_1);
     float openness_2 = float(int((point_3 & 255u)));
     float lit_1 = min((openness_2 * 0.019607844), 1.0);
-    float seen_1 = (lit_1 * lit_1 + PSAO_UNSEEN);
-    return PsaoPoint((vec3(steps_1) * scale), m, (m.x * m.x + (m.y * m.y + (m.z * m.z))), openness_2, ((int(point_3) >= 0) ? 0.0 : seen_1));
+    float seen_2 = (lit_1 * lit_1 + PSAO_UNSEEN);
+    return PsaoPoint((vec3(steps_1) * scale), m, (m.x * m.x + (m.y * m.y + (m.z * m.z))), openness_2, ((int(point_3) >= 0) ? 0.0 : seen_2));
 }
 
-float psao_dot(vec3 a, vec3 b) {
-    return (a.x * b.x + (a.y * b.y + (a.z * b.z)));
+PsaoTwo psao_two(vec3 a, vec3 b) {
+    return PsaoTwo(vec2(a.x, b.x), vec2(a.y, b.y), vec2(a.z, b.z));
 }
 
-vec2 psao_add(vec2 sums, float inverse_radius2_, vec3 normal_7, vec3 place_2, float share, uint word) {
-    PsaoPoint _e6 = psao_point(word);
-    vec3 d_3 = (_e6.place - place_2);
-    float _e10 = psao_dot(_e6.normal, normal_7);
-    float agree_1 = max(_e10, 0.0);
-    float agree2_1 = max((agree_1 * agree_1), (0.010000001 * _e6.square));
-    float _e18 = psao_dot(normal_7, d_3);
-    float _e20 = psao_dot(_e6.normal, d_3);
-    float h2_ = max(((_e18 * _e18) * _e6.square), (_e20 * _e20));
-    float _e26 = psao_dot(d_3, d_3);
-    float in_reach_1 = max((_e26 * (inverse_radius2_ * -0.8333333) + 1.0), PSAO_BEYOND);
-    float near = ((_e26 * inverse_radius2_ + PSAO_CORE) * _e6.square);
-    float apart_1 = (h2_ * (PSAO_FLATNESS * inverse_radius2_) + near);
-    float ratio = ((agree2_1 * agree2_1) / (apart_1 * _e6.square));
-    float weight_1 = (((share * _e6.seen) * in_reach_1) * (ratio * ratio));
-    return (vec2(weight_1) * vec2(1.0, _e6.openness) + sums);
+vec2 psao_dot_two(PsaoTwo a_1, PsaoTwo b_1) {
+    return (a_1.x * b_1.x + (a_1.y * b_1.y + (a_1.z * b_1.z)));
 }
 
-vec2 psao_blend_fast(uint instance_6, vec3 position_5, vec3 normal_8) {
+vec2 psao_dot_each(PsaoTwo a_2, vec3 b_2) {
+    return (a_2.x * vec2(b_2.x) + (a_2.y * vec2(b_2.y) + (a_2.z * b_2.z)));
+}
+
+PsaoSums psao_add(PsaoSums sums, PsaoSeen seen, uint word) {
+    PsaoPoint _e3 = psao_point(word);
+    vec3 p = _e3.place;
+    PsaoTwo d_3 = PsaoTwo((vec2(p.x) - seen.place.x), (vec2(p.y) - seen.place.y), (vec2(p.z) - seen.place.z));
+    vec2 _e23 = psao_dot_each(seen.normal, _e3.normal);
+    vec2 agree_1 = max(_e23, vec2(0.0));
+    vec2 agree2_1 = max((agree_1 * agree_1), vec2((0.010000001 * _e3.square)));
+    vec2 _e34 = psao_dot_two(seen.normal, d_3);
+    vec2 _e36 = psao_dot_each(d_3, _e3.normal);
+    vec2 h2_ = max(((_e34 * _e34) * _e3.square), (_e36 * _e36));
+    vec2 _e42 = psao_dot_two(d_3, d_3);
+    vec2 to_reach = (seen.inverse_radius2_ * -0.8333333);
+    vec2 in_reach_1 = max((_e42 * to_reach + vec2(1.0)), vec2(0.001));
+    vec2 near = ((_e42 * seen.inverse_radius2_ + vec2(0.5)) * _e3.square);
+    vec2 apart_1 = ((h2_ * (PSAO_FLATNESS * seen.inverse_radius2_) + near) * _e3.square);
+    vec2 ratio = ((agree2_1 * agree2_1) / apart_1);
+    vec2 weight_1 = (((seen.share * _e3.seen) * in_reach_1) * (ratio * ratio));
+    return PsaoSums((sums.weights + weight_1), (weight_1 * vec2(_e3.openness) + sums.openness));
+}
+
+vec2 psao_blend_fast(uint instance_6, vec3 position_5, vec3 normal_7) {
     PsaoBlock block_3 = PsaoBlock(uvec4(0u), uvec4(0u), 0u);
+    uint entry_1 = 0u;
     uint left = 0u;
-    vec2 sums_1 = vec2(0.0);
+    PsaoSums sums_1 = PsaoSums(vec2(0.0), vec2(0.0));
     uint round_1 = 0u;
     PsaoGrid _e3 = psao_grid_fast(instance_6);
-    PsaoFragment _e4 = psao_fragment(_e3, position_5, normal_8);
+    PsaoFragment _e4 = psao_fragment(_e3, position_5, normal_7);
     if (_e4.outside) {
         return vec2(1.0, 0.0);
     }
     uvec3 base_2 = uvec3(_e4.base);
     PsaoTable _e11 = psao_table(_e3, base_2);
-    PsaoBlock _e13 = psao_block(_e3, _e11, base_2, true);
+    uint _e12 = psao_within(_e3, base_2);
+    PsaoBlock _e13 = psao_block(_e11, _e12);
     block_3 = _e13;
     while(true) {
-        uint _e16 = block_3.unsure;
-        if ((_e16 != 0u)) {
-        } else {
+        uint _e18 = block_3.unsure;
+        uint _e19 = psao_lowest(_e18);
+        uvec3 _e20 = psao_corner(_e19);
+        uint _e21 = psao_key(_e11, _e20);
+        uint _e23 = block_3.unsure;
+        uint _e26 = psao_bucket(_e11, _e20);
+        uint _e27 = entry_1;
+        PsaoPeek _e28 = psao_peek((_e23 != 0u), _e26, _e21, _e27);
+        PsaoBlock _e29 = block_3;
+        PsaoBlock _e31 = psao_with(_e29, _e19, _e28.cell);
+        block_3 = _e31;
+        uint _e33 = block_3.unsure;
+        uint _e36 = block_3.unsure;
+        block_3.unsure = (_e33 & (_e28.last ? (_e36 - 1u) : 4294967295u));
+        uint _e42 = entry_1;
+        entry_1 = (_e28.last ? 0u : (_e42 + 1u));
+        uint _e49 = block_3.unsure;
+        if ((_e49 == 0u)) {
             break;
         }
-        {
-            uint _e20 = block_3.unsure;
-            uint _e21 = psao_lowest(_e20);
-            uvec3 _e22 = psao_corner(_e21);
-            uint _e23 = psao_bucket(_e11, _e22);
-            uint _e24 = psao_key(_e11, _e22);
-            uint _e25 = psao_search(_e23, _e24);
-            PsaoBlock _e26 = block_3;
-            PsaoBlock _e27 = psao_with(_e26, _e21, _e25);
-            block_3 = _e27;
-            uint _e29 = block_3.unsure;
-            uint _e31 = block_3.unsure;
-            block_3.unsure = (_e29 & (_e31 - 1u));
-        }
     }
-    PsaoBlock _e35 = block_3;
-    uint _e36 = psao_corners(_e35);
-    left = _e36;
-    float inverse_radius2_1 = (1.0 / (_e3.radius * _e3.radius));
+    PsaoBlock _e52 = block_3;
+    uint _e53 = psao_corners(_e52);
+    left = _e53;
+    vec3 start = (_e4.place - vec3(0.015625));
+    float inverse_radius2_ = (1.0 / (_e3.radius * _e3.radius));
     while(true) {
-        uint _e48 = left;
-        if ((_e48 != 0u)) {
-        } else {
+        uint _e72 = left;
+        uint _e73 = psao_lowest(_e72);
+        uvec3 _e74 = psao_corner(_e73);
+        PsaoBlock _e75 = block_3;
+        uint _e76 = psao_cell_at(_e75, _e74);
+        uint _e77 = psao_key(_e11, _e74);
+        uint _e78 = round_1;
+        PsaoRound _e79 = psao_round(_e76, _e77, _e78);
+        vec3 place_2 = (start - vec3(ivec3(_e74)));
+        PsaoTwo _e86 = psao_two(_e4.normal, vec3(0.0));
+        PsaoTwo _e89 = psao_two(place_2, vec3(0.0));
+        float _e92 = psao_share(place_2);
+        PsaoSeen seen_3 = PsaoSeen(_e86, _e89, vec2(inverse_radius2_, 0.0), vec2(_e92, 0.0));
+        PsaoSums _e96 = sums_1;
+        PsaoSums _e99 = psao_add(_e96, seen_3, _e79.points.x);
+        sums_1 = _e99;
+        PsaoSums _e100 = sums_1;
+        PsaoSums _e103 = psao_add(_e100, seen_3, _e79.points.y);
+        sums_1 = _e103;
+        PsaoSums _e104 = sums_1;
+        PsaoSums _e107 = psao_add(_e104, seen_3, _e79.points.z);
+        sums_1 = _e107;
+        uint _e109 = round_1;
+        round_1 = (_e79.more ? (_e109 + 1u) : 0u);
+        uint _e114 = left;
+        uint _e115 = left;
+        uint _e119 = left;
+        left = (_e79.more ? _e119 : (_e114 & (_e115 - 1u)));
+        uint _e122 = left;
+        if ((_e122 == 0u)) {
             break;
         }
-        {
-            uint _e51 = left;
-            uint _e52 = psao_lowest(_e51);
-            uvec3 _e53 = psao_corner(_e52);
-            PsaoBlock _e54 = block_3;
-            uint _e55 = psao_cell_at(_e54, _e53);
-            uint _e56 = psao_key(_e11, _e53);
-            uint _e57 = round_1;
-            PsaoRound _e58 = psao_round(_e55, _e56, _e57);
-            vec3 at = (_e4.place - vec3(ivec3(_e53)));
-            float _e63 = psao_share(at);
-            vec3 place_3 = (at - vec3(0.015625));
-            vec2 _e67 = sums_1;
-            vec2 _e71 = psao_add(_e67, inverse_radius2_1, _e4.normal, place_3, _e63, _e58.points.x);
-            sums_1 = _e71;
-            vec2 _e72 = sums_1;
-            vec2 _e76 = psao_add(_e72, inverse_radius2_1, _e4.normal, place_3, _e63, _e58.points.y);
-            sums_1 = _e76;
-            vec2 _e77 = sums_1;
-            vec2 _e81 = psao_add(_e77, inverse_radius2_1, _e4.normal, place_3, _e63, _e58.points.z);
-            sums_1 = _e81;
-            uint _e83 = round_1;
-            round_1 = (_e58.more ? (_e83 + 1u) : 0u);
-            uint _e88 = left;
-            uint _e89 = left;
-            uint _e93 = left;
-            left = (_e58.more ? _e93 : (_e88 & (_e89 - 1u)));
-        }
     }
-    float _e97 = sums_1.y;
-    float _e99 = sums_1.x;
-    float openness_3 = min(((_e97 / _e99) * 0.003921569), 1.0);
-    float _e106 = sums_1.x;
-    float _e108 = psao_seen(openness_3);
-    float near_1 = min((_e106 / (PSAO_NEAR * _e108)), 1.0);
-    float _e118 = sums_1.x;
-    return ((_e118 > 0.0) ? vec2(openness_3, near_1) : vec2(1.0, 0.0));
+    float _e127 = sums_1.openness.x;
+    float _e130 = sums_1.weights.x;
+    float openness_3 = min(((_e127 / _e130) * 0.003921569), 1.0);
+    float _e138 = sums_1.weights.x;
+    float _e140 = psao_seen(openness_3);
+    float near_1 = min((_e138 / (PSAO_NEAR * _e140)), 1.0);
+    float _e151 = sums_1.weights.x;
+    return ((_e151 > 0.0) ? vec2(openness_3, near_1) : vec2(1.0, 0.0));
 }
 
-float psao_planar_fast(uint instance_7, vec3 position_6, vec3 normal_9) {
-    vec2 _e3 = psao_blend_fast(instance_7, position_6, normal_9);
+float psao_planar_fast(uint instance_7, vec3 position_6, vec3 normal_8) {
+    vec2 _e3 = psao_blend_fast(instance_7, position_6, normal_8);
     return _e3.x;
 }
 
-float psao_over_baked(uint kernel, uint instance_8, vec3 position_7, vec3 normal_10, float baked, float share_1) {
+float psao_over_baked(uint kernel, uint instance_8, vec3 position_7, vec3 normal_9, float baked, float share) {
     vec2 found = vec2(1.0, 0.0);
-    if ((share_1 <= 0.0)) {
+    if ((share <= 0.0)) {
         return baked;
     }
     if ((kernel == PSAO_PAPER)) {
-        vec2 _e15 = psao_blend(false, instance_8, position_7, normal_10);
+        vec2 _e15 = psao_blend(false, instance_8, position_7, normal_9);
         found = _e15;
     } else {
-        vec2 _e16 = psao_blend_fast(instance_8, position_7, normal_10);
+        vec2 _e16 = psao_blend_fast(instance_8, position_7, normal_9);
         found = _e16;
     }
     float _e18 = found.x;
     float _e20 = found.y;
-    return mix(baked, _e18, (_e20 * min(share_1, 1.0)));
+    return mix(baked, _e18, (_e20 * min(share, 1.0)));
 }
