@@ -1507,25 +1507,28 @@ impl World {
         }
     }
 
-    /// The same of a slice's points one by one, those of `blocks`: a set, the first in the lowest
-    /// bit of the first word.
-    pub fn points_facing(&self, slice: &Slice, eye: Vec3, blocks: u64) -> PointBits {
-        let mut facing = [u64::MAX; SLICE_POINTS / 64];
+    /// The same of a slice's points one by one: those of `points` that may face the eye.
+    pub fn points_facing(&self, slice: &Slice, eye: Vec3, points: PointBits) -> PointBits {
+        if points == [0; SLICE_POINTS / 64] {
+            return points;
+        }
         let Some(eye) = self.local_eye(slice.instance, eye) else {
-            return facing;
+            return points;
         };
         let (positions, normals) = self.vertices(slice.instance);
         let triangles = &self.mesh(slice.instance).triangles;
-        let points = slice.points.start as usize..slice.points.end as usize;
-        for (block, points) in self.points[points].chunks(BLOCK).enumerate() {
-            if blocks >> block & 1 == 0 {
-                continue;
-            }
-            for (at, point) in (block * BLOCK..).zip(points) {
-                let (position, sides) = sides(point, triangles, positions, normals);
-                if !sides.iter().any(|side| eye.is_faced(position, *side)) {
-                    facing[at / 64] &= !(1 << (at % 64));
-                }
+        let of_slice = &self.points[slice.points.start as usize..slice.points.end as usize];
+        let mut facing = points;
+        for (points, facing) in of_slice.chunks(64).zip(&mut facing) {
+            let mut left = *facing;
+            while left != 0 {
+                let bit = left.trailing_zeros();
+                left &= left - 1;
+                let faces = points.get(bit as usize).is_some_and(|point| {
+                    let (position, sides) = sides(point, triangles, positions, normals);
+                    sides.iter().any(|side| eye.is_faced(position, *side))
+                });
+                *facing &= !(u64::from(!faces) << bit);
             }
         }
         facing
