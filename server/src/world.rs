@@ -943,11 +943,13 @@ impl World {
                         block.rate = block.rate.max(NEW_RATE);
                     }
                     let (age, rays) = (block.age(self.steps), block.rays + BLOCK_RAYS);
-                    // The mean squared error is least, for so many rays, where each block is
-                    // traced when rate² · age³ / rays has grown to the same value.
+                    // If the rate were known, the mean squared error would be least, for so many
+                    // rays, where each block is traced when weight · rate² · age³ / rays has grown
+                    // to the same value. It is a guess, so that what is dear waits less long than
+                    // that; and many rays of one point cost little more time than few.
                     let lag = ((block.rate + LEAST_RATE) * age).min(MOST_LAG);
                     candidates.push(Candidate {
-                        gain: lag * lag * age * owing.weight / rays as f32,
+                        gain: lag * lag * age * owing.weight / (rays as f32).sqrt(),
                         rays: u64::from(rays),
                         block: at,
                     });
@@ -1003,8 +1005,9 @@ impl World {
             let eyes = self.eyes.iter();
             let far = eyes.map(|eye| eye.distance(eye.clamp(min, max)));
             let nearest = far.fold(f32::INFINITY, f32::min).max(NEAREST_M);
-            // Its part of the picture.
-            owing.weight = 1.0 / (nearest * nearest);
+            // Less than its part of the picture, which is as the square of this: near slices are
+            // seen at a slant, and none far away is to wait for ever.
+            owing.weight = 1.0 / nearest;
             let eyes = self.eyes.iter();
             owing.wanted &= eyes.fold(0, |faces, eye| faces | self.facing(slice, *eye).any);
         }
@@ -1777,7 +1780,7 @@ const BLOCK_RAYS: u32 = 128;
 
 /// How fast what points say is taken to change, in 1/255 a step: at the least, as what moves may
 /// come nearer; and as long as nobody has looked, or what moves has only now come within reach.
-const LEAST_RATE: f32 = 0.1;
+const LEAST_RATE: f32 = 0.3;
 const NEW_RATE: f32 = 4.0;
 
 /// More than this says no more about what is urgent, 1/255.
@@ -1838,7 +1841,7 @@ struct Owing {
 
 /// A block that may have its turn.
 struct Candidate {
-    /// What it is worth, for each ray.
+    /// What it is worth.
     gain: f32,
     rays: u64,
     /// Into [`World::blocks`].
