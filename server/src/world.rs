@@ -943,11 +943,13 @@ impl World {
                         block.rate = block.rate.max(NEW_RATE);
                     }
                     let (age, rays) = (block.age(self.steps), block.rays + BLOCK_RAYS);
-                    // The mean squared error is least, for so many rays, where each block is
-                    // traced when rate² · age³ / rays has grown to the same value.
+                    // If the rate were known, the mean squared error would be least, for so many
+                    // rays, where each block is traced when weight · rate² · age³ / rays has grown
+                    // to the same value. It is a guess, so that what is dear waits less long than
+                    // that; and many rays of one point cost little more time than few.
                     let lag = ((block.rate + LEAST_RATE) * age).min(MOST_LAG);
                     candidates.push(Candidate {
-                        gain: lag * lag * age * owing.weight / rays as f32,
+                        gain: lag * lag * age * owing.weight / (rays as f32).sqrt(),
                         rays: u64::from(rays),
                         block: at,
                     });
@@ -1003,8 +1005,9 @@ impl World {
             let eyes = self.eyes.iter();
             let far = eyes.map(|eye| eye.distance(eye.clamp(min, max)));
             let nearest = far.fold(f32::INFINITY, f32::min).max(NEAREST_M);
-            // Its part of the picture.
-            owing.weight = 1.0 / (nearest * nearest);
+            // Less than its part of the picture, which is as the square of this: near slices are
+            // seen at a slant, and none far away is to wait for ever.
+            owing.weight = 1.0 / nearest;
             let eyes = self.eyes.iter();
             owing.wanted &= eyes.fold(0, |faces, eye| faces | self.facing(slice, *eye).any);
         }
@@ -1507,25 +1510,28 @@ impl World {
         }
     }
 
-    /// The same of a slice's points one by one, those of `blocks`: a set, the first in the lowest
-    /// bit of the first word.
-    pub fn points_facing(&self, slice: &Slice, eye: Vec3, blocks: u64) -> PointBits {
-        let mut facing = [u64::MAX; SLICE_POINTS / 64];
+    /// The same of a slice's points one by one: those of `points` that may face the eye.
+    pub fn points_facing(&self, slice: &Slice, eye: Vec3, points: PointBits) -> PointBits {
+        if points == [0; SLICE_POINTS / 64] {
+            return points;
+        }
         let Some(eye) = self.local_eye(slice.instance, eye) else {
-            return facing;
+            return points;
         };
         let (positions, normals) = self.vertices(slice.instance);
         let triangles = &self.mesh(slice.instance).triangles;
-        let points = slice.points.start as usize..slice.points.end as usize;
-        for (block, points) in self.points[points].chunks(BLOCK).enumerate() {
-            if blocks >> block & 1 == 0 {
-                continue;
-            }
-            for (at, point) in (block * BLOCK..).zip(points) {
-                let (position, sides) = sides(point, triangles, positions, normals);
-                if !sides.iter().any(|side| eye.is_faced(position, *side)) {
-                    facing[at / 64] &= !(1 << (at % 64));
-                }
+        let of_slice = &self.points[slice.points.start as usize..slice.points.end as usize];
+        let mut facing = points;
+        for (points, facing) in of_slice.chunks(64).zip(&mut facing) {
+            let mut left = *facing;
+            while left != 0 {
+                let bit = left.trailing_zeros();
+                left &= left - 1;
+                let faces = points.get(bit as usize).is_some_and(|point| {
+                    let (position, sides) = sides(point, triangles, positions, normals);
+                    sides.iter().any(|side| eye.is_faced(position, *side))
+                });
+                *facing &= !(u64::from(!faces) << bit);
             }
         }
         facing
@@ -1774,7 +1780,7 @@ const BLOCK_RAYS: u32 = 128;
 
 /// How fast what points say is taken to change, in 1/255 a step: at the least, as what moves may
 /// come nearer; and as long as nobody has looked, or what moves has only now come within reach.
-const LEAST_RATE: f32 = 0.1;
+const LEAST_RATE: f32 = 0.3;
 const NEW_RATE: f32 = 4.0;
 
 /// More than this says no more about what is urgent, 1/255.
@@ -1835,7 +1841,7 @@ struct Owing {
 
 /// A block that may have its turn.
 struct Candidate {
-    /// What it is worth, for each ray.
+    /// What it is worth.
     gain: f32,
     rays: u64,
     /// Into [`World::blocks`].

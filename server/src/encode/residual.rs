@@ -103,6 +103,8 @@ struct Lack {
     opens: bool,
     /// Blocks to bring up to date. The others are not in the picture, and stay as they are.
     blocks: u64,
+    /// Blocks that are due and need nothing, in the picture or not.
+    near_enough: u64,
     /// Points (of the world's) that are not in the picture.
     free: PointBits,
     /// Visible error: squared, over all other points, a square metre's part of the picture.
@@ -113,7 +115,7 @@ struct Lack {
 enum Off {
     /// Nothing that counts.
     Near,
-    /// So little that it may wait.
+    /// So little that it waits.
     Little,
     Far,
 }
@@ -287,18 +289,14 @@ impl Residual {
             .filter_map(|&index| this.check(world, view, index))
             .collect();
         let mut lacks = Vec::new();
-        let now = self.sight.frames();
-        let patience = (WAIT_S * self.rate_hz) as u64;
         for (lack, off) in checked {
+            // Until the world changes them again.
+            self.due[lack.index as usize] &= !lack.near_enough;
             let since = &mut self.little_since[lack.index as usize];
             match off {
-                Off::Near => {
-                    // Until the world changes it again.
-                    self.due[lack.index as usize] &= !lack.blocks;
-                    *since = None;
-                }
-                Off::Little if now - *since.get_or_insert(now) < patience => {}
-                Off::Little | Off::Far => lacks.push(lack),
+                Off::Near => *since = None,
+                Off::Little => *since = since.or(Some(self.sight.frames())),
+                Off::Far => lacks.push(lack),
             }
         }
         lacks
@@ -319,6 +317,7 @@ impl Residual {
             index,
             opens,
             blocks: u64::MAX,
+            near_enough: 0,
             free: [0; SLICE_POINTS / 64],
             weight: 0.0,
         };
@@ -333,38 +332,43 @@ impl Residual {
             lack.weight = (dark + want_a_little(slice)) as f32 / near();
             return Some((lack, Off::Far));
         }
-        if !fading {
-            let Faces { any, all } = view.blocks(world, slice, due);
-            if any == 0 {
-                return None;
-            }
-            lack.blocks = any;
-            lack.free = free(world, view, slice, any, all);
-        }
         let level = self.mirror.instances()[slice.instance as usize].level;
-        let (squares, near_enough) = error(
-            world,
-            slice,
-            level,
-            self.heap.values(open),
-            &lack,
-            self.quantiser,
-        );
+        let asked = if fading { u64::MAX } else { due };
+        let have = self.heap.values(open);
+        let differences = Differences::of(world, slice, level, have, asked, self.quantiser);
         let missing = to_show(world, &self.mirror, slice, open) & !open.shown;
-        let shows = missing & lack.blocks != 0;
-        lack.weight = (squares as f32 + f32::from(u8::from(shows))) / near();
-        let dead_zone = u64::from(self.quantiser.dead_zone);
-        let off = if shows || fading {
-            Off::Far
-        } else if squares == 0 {
-            lack.blocks &= near_enough;
-            Off::Near
-        } else if dead_zone > 0 && squares < LITTLE * (dead_zone + 1).pow(2) {
-            Off::Little
-        } else {
-            Off::Far
+        let differing = differences.blocks();
+        let [any, all] = [differing; 2];
+        let (mut shows, mut faces) = (missing, Faces { any, all });
+        if !fading {
+            lack.near_enough = due & !differing & !missing;
+            faces = view.blocks(world, slice, due & (differing | missing));
+            lack.blocks = faces.any;
+            shows &= faces.any;
+        }
+        let squares = differences.squares(&in_picture(world, view, slice, faces, &differences.off));
+        lack.weight = (squares as f32 + f32::from(u8::from(shows != 0))) / near();
+        let off = match squares {
+            _ if shows != 0 || fading => Off::Far,
+            0 => Off::Near,
+            squares if self.waits(index, squares) => Off::Little,
+            _ => Off::Far,
         };
+        if matches!(off, Off::Far) && !fading {
+            let everything = [u64::MAX; SLICE_POINTS / 64];
+            let needed = in_picture(world, view, slice, faces, &everything);
+            lack.free = needed.map(|word| !word);
+        }
         Some((lack, off))
+    }
+
+    /// Whether a slice that is off by so much, squared and summed, may wait for more.
+    fn waits(&self, index: u32, squares: u64) -> bool {
+        let least = u64::from(self.quantiser.dead_zone) + 1;
+        let waited =
+            self.little_since[index as usize].map_or(0, |since| self.sight.frames() - since);
+        // Without a dead zone nothing is to be off.
+        least > 1 && squares < LITTLE * least.pow(2) && waited < (WAIT_S * self.rate_hz) as u64
     }
 
     /// Takes instances from the client that are out of the scene.
@@ -756,61 +760,106 @@ fn to_show(world: &World, mirror: &Mirror<Heap>, slice: &Slice, open: &slices::S
     }
 }
 
-/// The points of some blocks of a slice that are not in the picture; `all`: the blocks that have none.
-/// All points of other blocks are not either.
-fn free(world: &World, view: &View<'_>, slice: &Slice, any: u64, all: u64) -> PointBits {
-    let mut free = [0; SLICE_POINTS / 64];
-    let Some(eye) = view.eye else { return free };
-    let facing = match any & !all {
-        0 => [u64::MAX; SLICE_POINTS / 64],
-        mixed => world.points_facing(slice, eye.camera.position, mixed),
-    };
-    for (word, (free, facing)) in free.iter_mut().zip(facing).enumerate() {
-        for part in 0..64 / BLOCK {
-            let in_picture = any >> (word * (64 / BLOCK) + part) & 1 != 0;
-            let block = ((1 << BLOCK) - 1) << (part * BLOCK);
-            *free |= block & if in_picture { !facing } else { u64::MAX };
+/// Those of some points of a slice that are in the picture, of which these blocks are.
+fn in_picture(
+    world: &World,
+    view: &View<'_>,
+    slice: &Slice,
+    blocks: Faces,
+    points: &PointBits,
+) -> PointBits {
+    let Faces { any, all } = blocks;
+    let of = |blocks: u64| {
+        let mut points = *points;
+        for (word, points) in points.iter_mut().enumerate() {
+            for part in 0..64 / BLOCK {
+                let block = ((1 << BLOCK) - 1) << (part * BLOCK);
+                if blocks >> (word * (64 / BLOCK) + part) & 1 == 0 {
+                    *points &= !block;
+                }
+            }
         }
-    }
-    free
+        points
+    };
+    let Some(eye) = view.eye else { return of(any) };
+    let mut shown = world.points_facing(slice, eye.camera.position, of(any & !all));
+    let whole = of(all);
+    shown
+        .iter_mut()
+        .zip(whole)
+        .for_each(|(s, whole)| *s |= whole);
+    shown
 }
 
-/// Squared error of a slice's points in the picture that the codec would not leave as they are; and
-/// the blocks in which it would leave all, in the picture or not. `have`: what the client's points
-/// of the level say.
-fn error(
-    world: &World,
-    slice: &Slice,
-    level: u32,
-    have: &[u8],
-    lack: &Lack,
-    quantiser: Quantiser,
-) -> (u64, u64) {
-    let (mut squares, mut near_enough) = (0, u64::MAX);
-    let mut compare = |at: usize, want: u8, have: u8| {
-        if !quantiser.leaves(have, want) {
-            near_enough &= !(1 << (at / BLOCK));
-            if lack.free[at / 64] >> (at % 64) & 1 == 0 {
-                squares += u64::from(want.abs_diff(have)).pow(2);
+/// Where a slice's points are not near enough to what they should say.
+struct Differences {
+    off: PointBits,
+    /// By how much, of every point in `off`.
+    by: [u8; SLICE_POINTS],
+}
+
+impl Differences {
+    /// In some blocks. `have`: what the client's points of the level say.
+    fn of(
+        world: &World,
+        slice: &Slice,
+        level: u32,
+        have: &[u8],
+        blocks: u64,
+        quantiser: Quantiser,
+    ) -> Differences {
+        let mut found = Differences {
+            off: [0; SLICE_POINTS / 64],
+            by: [0; SLICE_POINTS],
+        };
+        let mut compare = |at: usize, want: u8, have: u8| {
+            let off = !quantiser.leaves(have, want);
+            found.off[at / 64] |= u64::from(off) << (at % 64);
+            found.by[at] = want.abs_diff(have);
+        };
+        let is_asked = |at: usize| blocks >> (at / BLOCK) & 1 != 0;
+        let want = world.occlusion(slice);
+        if want.len() == have.len() {
+            let pairs = want.chunks(BLOCK).zip(have.chunks(BLOCK)).enumerate();
+            for (block, (want, have)) in pairs.filter(|(block, _)| is_asked(block * BLOCK)) {
+                for (at, (want, have)) in (block * BLOCK..).zip(want.iter().zip(have)) {
+                    compare(at, *want, *have);
+                }
+            }
+        } else {
+            let points = want.iter().zip(world.levels(slice)).enumerate();
+            let of_level = points.filter(|(_, (_, has))| u32::from(**has) >= level);
+            for ((at, (want, _)), have) in of_level.zip(have) {
+                if is_asked(at) {
+                    compare(at, *want, *have);
+                }
             }
         }
-    };
-    let want = world.occlusion(slice);
-    if want.len() == have.len() {
-        let pairs = want.chunks(BLOCK).zip(have.chunks(BLOCK)).enumerate();
-        for (block, (want, have)) in pairs.filter(|(block, _)| lack.blocks >> block & 1 != 0) {
-            for (at, (want, have)) in (block * BLOCK..).zip(want.iter().zip(have)) {
-                compare(at, *want, *have);
-            }
-        }
-    } else {
-        let points = want.iter().zip(world.levels(slice)).enumerate();
-        let of_level = points.filter(|(_, (_, has))| u32::from(**has) >= level);
-        for ((at, (want, _)), have) in of_level.zip(have) {
-            compare(at, *want, *have);
-        }
+        found
     }
-    (squares, near_enough)
+
+    /// The blocks that have any.
+    fn blocks(&self) -> u64 {
+        let parts = (0..SLICE_POINTS).step_by(BLOCK);
+        let block = |at: usize| self.off[at / 64] >> (at % 64) & ((1 << BLOCK) - 1) != 0;
+        parts
+            .rev()
+            .fold(0, |blocks, at| blocks << 1 | u64::from(block(at)))
+    }
+
+    /// The sum of the squares of some of them.
+    fn squares(&self, of: &PointBits) -> u64 {
+        let mut sum = 0;
+        for (word, points) in of.iter().enumerate() {
+            let mut left = *points;
+            while left != 0 {
+                let at = word * 64 + left.trailing_zeros() as usize;
+                left &= left - 1;
+                sum += u64::from(self.by[at]).pow(2);
+            }
+        }
+        sum
+    }
 }
 
 /// A slice without darkness is still a little better had than not.
