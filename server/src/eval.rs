@@ -228,13 +228,10 @@ pub struct Comparison {
     pub bits_cells_over_residual_shipped: Option<f64>,
     /// That error is outside of what the quantisers span.
     pub extrapolated: bool,
-    /// The quantiser nearest to that error, which the times are of.
-    pub nearest_quant: String,
-    /// Its error, 1/255.
-    pub nearest_rmse_255: f64,
-    /// Decode time of `residual` over that of `cells`.
+    /// Decode time of `residual` over that of `cells`, interpolated as the bits are; of the nearest
+    /// quantiser where there is nothing to interpolate between.
     pub decode_residual_over_cells: f64,
-    /// Encode time of `cells` over that of `residual`.
+    /// Encode time of `cells` over that of `residual`, in the same way.
     pub encode_cells_over_residual: f64,
 }
 
@@ -453,7 +450,9 @@ impl Bench<'_> {
             let cells = stream.encoder.cells(world);
             let steps = step_ms[steady..].iter();
             let frames = steps.zip(&stream.frames[steady..]);
-            let frames: Vec<f64> = frames.map(|(step, own)| step + own.encode_ms).collect();
+            let frames: Vec<f64> = frames
+                .map(|(step, own)| step + own.select_ms + own.encode_ms)
+                .collect();
             found.kbits.push(stream.kbits());
             found.rows.push(Row {
                 scene: world.scene.name.clone(),
@@ -719,10 +718,10 @@ pub(crate) fn percentile(values: &[f64], share: f64) -> f64 {
         .unwrap_or(0.0)
 }
 
-/// Mbit/s at a point error, from measured pairs of both: on straight lines through neighbouring
-/// pairs, with bits logarithmic. Pairs that another betters in both count for nothing. Also says
-/// whether the error is outside of the rest.
-fn bits_at(rmse: f64, measured: &[(f64, f64)]) -> Option<(f64, bool)> {
+/// What a point error costs in bits or time, from measured pairs of both: on straight lines through
+/// neighbouring pairs, with the cost logarithmic. Pairs that another betters in both count for
+/// nothing. Also says whether the error is outside of the rest.
+fn cost_at(rmse: f64, measured: &[(f64, f64)]) -> Option<(f64, bool)> {
     let mut sorted = measured.to_vec();
     sorted.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.total_cmp(&b.1)));
     let mut pairs: Vec<(f64, f64)> = Vec::new();
@@ -731,7 +730,7 @@ fn bits_at(rmse: f64, measured: &[(f64, f64)]) -> Option<(f64, bool)> {
             pairs.push(pair);
         }
     }
-    if pairs.len() < 2 || pairs.iter().any(|(_, bits)| *bits <= 0.0) {
+    if pairs.len() < 2 || pairs.iter().any(|(_, cost)| *cost <= 0.0) {
         return None;
     }
     let above = pairs.partition_point(|(error, _)| *error < rmse);
@@ -740,9 +739,9 @@ fn bits_at(rmse: f64, measured: &[(f64, f64)]) -> Option<(f64, bool)> {
         [pairs[upper - 1], pairs[upper]]
     };
     let along = (rmse - x0) / (x1 - x0);
-    let bits = (y0.ln() + along * (y1.ln() - y0.ln())).exp();
+    let cost = (y0.ln() + along * (y1.ln() - y0.ln())).exp();
     let extrapolated = rmse < pairs[0].0 || rmse > pairs[pairs.len() - 1].0;
-    Some((bits, extrapolated))
+    Some((cost, extrapolated))
 }
 
 /// Lines as a table whose columns line up, the first its head.
@@ -787,10 +786,11 @@ impl Evaluation {
             .iter()
             .min_by(|a, b| off(a, cells.rmse_255).total_cmp(&off(b, cells.rmse_255)));
         let Some(nearest) = nearest else { return };
-        let at_equal_error = |bits: &dyn Fn(&Row) -> f64| {
-            let measured = residual.iter().map(|row| (row.rmse_255, bits(row)));
-            bits_at(cells.rmse_255, &measured.collect::<Vec<_>>())
+        let at_equal_error = |cost: &dyn Fn(&Row) -> f64| {
+            let measured = residual.iter().map(|row| (row.rmse_255, cost(row)));
+            cost_at(cells.rmse_255, &measured.collect::<Vec<_>>())
         };
+        let time = |ms: &dyn Fn(&Row) -> f64| at_equal_error(ms).map_or(ms(nearest), |(ms, _)| ms);
         let bits = at_equal_error(&|row| row.mbit_per_s);
         let shipped = at_equal_error(&|row| row.mbit_per_s - row.mbit_per_s_topology);
         let comparison = Comparison {
@@ -801,10 +801,8 @@ impl Evaluation {
             bits_cells_over_residual: bits.map(|(bits, _)| cells.mbit_per_s / bits),
             bits_cells_over_residual_shipped: shipped.map(|(bits, _)| cells.mbit_per_s / bits),
             extrapolated: bits.is_some_and(|(_, extrapolated)| extrapolated),
-            nearest_quant: nearest.quant.clone(),
-            nearest_rmse_255: nearest.rmse_255,
-            decode_residual_over_cells: nearest.decode_ms / cells.decode_ms,
-            encode_cells_over_residual: cells.encode_ms / nearest.encode_ms,
+            decode_residual_over_cells: time(&|row| row.decode_ms) / cells.decode_ms,
+            encode_cells_over_residual: cells.encode_ms / time(&|row| row.encode_ms),
         };
         self.comparisons.push(comparison);
     }
@@ -830,7 +828,7 @@ impl Evaluation {
             "select ms",
             "step ms",
             "p99",
-            "step + encode",
+            "frame ms",
             "p99",
             "krays",
             "points",
@@ -897,15 +895,12 @@ impl Evaluation {
                 ),
                 format!(
                     "bits of cells over residual at {:.3}/255 rms {bits}, with the topology \
-                     shipped {}; at {} ({:.3}/255): \
-                     decode time of residual over cells {:.2}, encode time of cells over residual \
-                     {:.1}",
+                     shipped {}; decode time of residual over cells {:.2}, encode time of cells \
+                     over residual {:.1}",
                     found.rmse_255,
                     found
                         .bits_cells_over_residual_shipped
                         .map_or("unknown".into(), |ratio| format!("{ratio:.1}")),
-                    found.nearest_quant,
-                    found.nearest_rmse_255,
                     found.decode_residual_over_cells,
                     found.encode_cells_over_residual
                 ),
@@ -1081,7 +1076,7 @@ mod tests {
     fn bits_are_interpolated_on_a_log_scale_and_extrapolation_is_said() {
         // The last is worse than the first in both.
         let measured = [(2.0, 1.0), (1.0, 10.0), (4.0, 0.5), (3.0, 2.0)];
-        let at = |rmse| bits_at(rmse, &measured).expect("three points");
+        let at = |rmse| cost_at(rmse, &measured).expect("three points");
         let near = |(bits, out): (f64, bool), want: f64, extrapolated| {
             assert!((bits / want - 1.0).abs() < 1e-9, "{bits} instead of {want}");
             assert_eq!(out, extrapolated);
@@ -1097,10 +1092,10 @@ mod tests {
 
     #[test]
     fn no_ratio_is_made_up_from_one_quantiser_or_none_or_silence() {
-        assert_eq!(bits_at(1.0, &[]), None);
-        assert_eq!(bits_at(1.0, &[(1.0, 5.0)]), None);
-        assert_eq!(bits_at(1.0, &[(1.0, 5.0), (1.0, 6.0)]), None);
-        assert_eq!(bits_at(1.0, &[(1.0, 5.0), (2.0, 0.0)]), None);
+        assert_eq!(cost_at(1.0, &[]), None);
+        assert_eq!(cost_at(1.0, &[(1.0, 5.0)]), None);
+        assert_eq!(cost_at(1.0, &[(1.0, 5.0), (1.0, 6.0)]), None);
+        assert_eq!(cost_at(1.0, &[(1.0, 5.0), (2.0, 0.0)]), None);
     }
 
     #[test]
