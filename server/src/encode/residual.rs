@@ -191,6 +191,11 @@ impl Residual {
         self.capacity
     }
 
+    /// The grid that a slice's points lie in at the client.
+    fn grid(&self, slice: &Slice) -> &Instance {
+        &self.mirror.instances()[slice.instance as usize]
+    }
+
     pub fn reset(&mut self) {
         self.mirror.reset();
         self.mirror.clear_dirty();
@@ -332,7 +337,7 @@ impl Residual {
             lack.weight = (dark + want_a_little(slice)) as f32 / near();
             return Some((lack, Off::Far));
         }
-        let level = self.mirror.instances()[slice.instance as usize].level;
+        let level = self.grid(slice).level;
         let asked = if fading { u64::MAX } else { due };
         let have = self.heap.values(open);
         let differences = Differences::of(world, slice, level, have, asked, self.quantiser);
@@ -531,7 +536,7 @@ impl Residual {
     /// What a slice's points should say at the client now.
     fn target(&self, world: &World, index: u32) -> Vec<u8> {
         let slice = &world.slices[index as usize];
-        let level = self.mirror.instances()[slice.instance as usize].level;
+        let level = self.grid(slice).level;
         let points = world.occlusion(slice).iter().zip(world.levels(slice));
         let of_level = points.filter(|(_, has)| u32::from(**has) >= level);
         let mut target: Vec<u8> = of_level.map(|(occlusion, _)| *occlusion).collect();
@@ -555,7 +560,7 @@ impl Residual {
         out: &mut Frame,
         stats: &mut FrameStats,
     ) {
-        let level = |slice: &Slice| self.mirror.instances()[slice.instance as usize].level;
+        let level = |slice: &Slice| self.grid(slice).level;
         let slice = |lack: &Lack| &world.slices[lack.index as usize];
         batch.par_iter().filter(|lack| lack.opens).for_each(|lack| {
             let (slice, topology) = (slice(lack), &world.topology);
@@ -643,7 +648,7 @@ impl Residual {
     /// yet. Returns what the item says of it, if there is room.
     fn open(&mut self, world: &World, index: u32, out: &mut Frame) -> Option<[u32; 3]> {
         let slice = &world.slices[index as usize];
-        let grid = self.mirror.instances()[slice.instance as usize];
+        let grid = *self.grid(slice);
         let points = || world.topology.points_of(slice.patch, grid.level);
         let count = points().count() as u32;
         if count == 0 {
@@ -686,7 +691,7 @@ impl Residual {
         let slice = self.heap.get()[index as usize];
         let target = self.target(world, index);
         let of = &world.slices[index as usize];
-        let level = self.mirror.instances()[of.instance as usize].level;
+        let level = self.grid(of).level;
         // The numbers that the points of the level have in the world's slice.
         let numbers = (0..).zip(world.levels(of));
         let numbers = numbers.filter(|(_, has)| u32::from(**has) >= level);
