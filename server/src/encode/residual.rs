@@ -343,8 +343,11 @@ impl Residual {
         let differences = Differences::of(world, slice, level, have, asked, self.quantiser);
         let missing = to_show(world, &self.mirror, slice, open) & !open.shown;
         let differing = differences.blocks();
-        let [any, all] = [differing; 2];
-        let (mut shows, mut faces) = (missing, Faces { any, all });
+        let mut shows = missing;
+        let mut faces = Faces {
+            any: differing,
+            all: differing,
+        };
         if !fading {
             lack.near_enough = due & !differing & !missing;
             faces = view.blocks(world, slice, due & (differing | missing));

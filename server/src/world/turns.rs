@@ -1,0 +1,206 @@
+//! Which points are traced now that something moved near them, where there are fewer rays than all
+//! of them need.
+
+use super::World;
+use crate::facing::Faces;
+use crate::topology::SLICE_BLOCKS;
+use psao_core::residual::BLOCK;
+use rayon::prelude::*;
+
+/// An eye within this of a slice sees no more of it, metres.
+const NEAREST_M: f32 = 0.5;
+
+/// What choosing and culling the points of a block costs, in rays.
+const BLOCK_RAYS: u32 = 128;
+
+/// How fast what points say is taken to change, in 1/255 a step: at the least, as what moves may
+/// come nearer; and as long as nobody has looked, or what moves has only now come within reach.
+const LEAST_RATE: f32 = 0.3;
+const NEW_RATE: f32 = 4.0;
+
+/// More than this says no more about what is urgent, 1/255.
+const MOST_LAG: f32 = 64.0;
+
+/// Which blocks of a slice are due; the first in the lowest bit.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Turn {
+    /// Blocks that may say what was true before something moved.
+    pub(super) owed: u64,
+    /// Those that movers reach, and those that they reached when they were traced last.
+    pub(super) near: u64,
+    pub(super) had: u64,
+    /// Those of which only points of [`World::finest_levels`] were traced since something moved.
+    pub(super) missed: u64,
+    /// The step at which the slice was visible last; it was not at the one before.
+    pub(super) seen_at: u64,
+    pub(super) is_new: bool,
+}
+
+/// How urgent some points of a slice are.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Block {
+    /// The step at which they were traced last.
+    pub(super) traced_at: u64,
+    /// How fast what they say changed before that, 1/255 a step, root mean square.
+    pub(super) rate: f32,
+    /// The rays that it took.
+    pub(super) rays: u32,
+}
+
+impl Default for Block {
+    /// Nothing is known.
+    fn default() -> Block {
+        Block {
+            traced_at: 0,
+            rate: NEW_RATE,
+            rays: 64 * BLOCK as u32,
+        }
+    }
+}
+
+impl Block {
+    pub(super) fn age(&self, steps: u64) -> f32 {
+        (steps - self.traced_at) as f32
+    }
+}
+
+/// What a visible slice owes: see [`Turn`].
+struct Owing {
+    near: u64,
+    owed: u64,
+    /// Blocks owed that may show.
+    wanted: u64,
+    /// What an error shows, relative to others'.
+    weight: f32,
+}
+
+/// A block that may have its turn.
+struct Candidate {
+    /// What it is worth.
+    gain: f32,
+    rays: u64,
+    /// Into [`World::blocks`].
+    block: usize,
+}
+
+/// Blocks of a slice that are to be traced.
+pub(super) struct Due {
+    pub(super) slice: usize,
+    /// As many of the rays are to be known.
+    pub(super) rays: usize,
+    pub(super) blocks: u64,
+}
+
+impl World {
+    /// Which blocks of the slices `asked` are traced now: all where rays are gained, and within a
+    /// budget of rays those of the others that something moved near. And how many of these wait.
+    pub(super) fn take_turns(
+        &mut self,
+        asked: &[(usize, usize)],
+        refresh_rays: u64,
+    ) -> (Vec<Due>, u64) {
+        let looked: Vec<Owing> = asked
+            .par_iter()
+            .map(|&(slice, _)| self.owing(slice))
+            .collect();
+        let mut due = Vec::new();
+        let mut candidates = Vec::new();
+        for (owing, &(index, rays)) in looked.iter().zip(asked) {
+            let slice = &mut self.slices[index];
+            slice.stale = false;
+            let turn = &mut self.turns[index];
+            let all = if turn.is_new { u64::MAX } else { 0 };
+            let unknown = all | owing.near & !turn.near;
+            (turn.near, turn.owed) = (owing.near, owing.owed);
+            if rays > slice.rays_done {
+                due.push(Due {
+                    slice: index,
+                    rays,
+                    blocks: Faces::all_of(slice).any,
+                });
+            } else if rays > 0 && refresh_rays == u64::MAX {
+                due.push(Due {
+                    slice: index,
+                    rays,
+                    blocks: owing.wanted,
+                });
+            } else if rays > 0 {
+                let blocks = (0..SLICE_BLOCKS).filter(|block| owing.wanted >> block & 1 == 1);
+                for number in blocks {
+                    let at = index * SLICE_BLOCKS + number;
+                    let block = &mut self.blocks[at];
+                    if unknown >> number & 1 == 1 {
+                        block.rate = block.rate.max(NEW_RATE);
+                    }
+                    let (age, rays) = (block.age(self.steps), block.rays + BLOCK_RAYS);
+                    // If the rate were known, the mean squared error would be least, for so many
+                    // rays, where each block is traced when weight · rate² · age³ / rays has grown
+                    // to the same value. It is a guess, so that what is dear waits less long than
+                    // that; and many rays of one point cost little more time than few.
+                    let lag = ((block.rate + LEAST_RATE) * age).min(MOST_LAG);
+                    candidates.push(Candidate {
+                        gain: lag * lag * age * owing.weight / (rays as f32).sqrt(),
+                        rays: u64::from(rays),
+                        block: at,
+                    });
+                }
+            }
+        }
+        candidates.sort_unstable_by(|a, b| {
+            let order = b.gain.total_cmp(&a.gain);
+            order.then(a.block.cmp(&b.block))
+        });
+        let mut left = refresh_rays;
+        let fits = |candidate: &&Candidate| {
+            let fits = left > 0;
+            left = left.saturating_sub(candidate.rays);
+            fits
+        };
+        let taken = candidates.iter().take_while(fits).count();
+        let waiting = (candidates.len() - taken) as u64;
+        candidates.truncate(taken);
+        candidates.sort_unstable_by_key(|candidate| candidate.block);
+        for turn in candidates.chunk_by(|a, b| a.block / SLICE_BLOCKS == b.block / SLICE_BLOCKS) {
+            let index = turn[0].block / SLICE_BLOCKS;
+            let bits = turn.iter().map(|own| 1u64 << (own.block % SLICE_BLOCKS));
+            due.push(Due {
+                slice: index,
+                rays: self.slices[index].rays_done,
+                blocks: bits.fold(0, |blocks, bit| blocks | bit),
+            });
+        }
+        due.retain(|due| due.blocks > 0);
+        due.sort_unstable_by_key(|due| due.slice);
+        (due, waiting)
+    }
+
+    /// What a visible slice owes in the present pose.
+    fn owing(&self, index: usize) -> Owing {
+        let (slice, turn) = (&self.slices[index], &self.turns[index]);
+        let (near, owed) = if slice.stale {
+            (self.near_movers(slice), u64::MAX)
+        } else {
+            (turn.near, turn.owed)
+        };
+        // What no mover reaches, and none did, says what it said.
+        let owed = owed & (near | turn.had) & Faces::all_of(slice).any;
+        let mut owing = Owing {
+            near,
+            owed,
+            wanted: owed,
+            weight: 1.0,
+        };
+        if !self.eyes.is_empty() && owed > 0 {
+            let [min, max] = slice.bounds;
+            let eyes = self.eyes.iter();
+            let far = eyes.map(|eye| eye.distance(eye.clamp(min, max)));
+            let nearest = far.fold(f32::INFINITY, f32::min).max(NEAREST_M);
+            // Less than its part of the picture, which is as the square of this: near slices are
+            // seen at a slant, and none far away is to wait for ever.
+            owing.weight = 1.0 / nearest;
+            let eyes = self.eyes.iter();
+            owing.wanted &= eyes.fold(0, |faces, eye| faces | self.facing(slice, *eye).any);
+        }
+        owing
+    }
+}
