@@ -5,6 +5,7 @@ pub mod bake;
 #[cfg(feature = "gpu")]
 pub mod bench_gpu;
 pub mod camera;
+pub mod clusters;
 pub mod commands;
 pub mod demo;
 pub mod encode;

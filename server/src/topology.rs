@@ -1,6 +1,7 @@
 //! Topology of profile `residual`: each mesh's points once, in patches that its instances share.
 
-use crate::points::{SurfacePoint, morton_order};
+use crate::clusters::gather;
+use crate::points::SurfacePoint;
 use crate::scene::Mesh;
 use crate::truth::{Placement, buckets_for, choose_buckets};
 use glam::Vec3;
@@ -24,6 +25,8 @@ pub struct PointSet {
     pub points: Vec<SurfacePoint>,
     /// The same as the stream has them.
     pub coded: Vec<PatchPoint>,
+    /// Where each patch's begin in them, and the end.
+    first_point: Vec<usize>,
     /// The grid at each level, without a place in the bucket buffer.
     pub levels: Vec<Level>,
     /// Patches by place: what has points in, or a cell beside, each part of the grid of level 0.
@@ -52,23 +55,17 @@ impl PointSet {
             .iter()
             .map(|p| p.position(&mesh.triangles, &mesh.positions))
             .collect();
-        let bounds = local
-            .iter()
-            .fold([Vec3::INFINITY, Vec3::NEG_INFINITY], |[min, max], p| {
-                [min.min(*p), max.max(*p)]
-            });
         let place = |(point, at): (&SurfacePoint, &Vec3)| {
             let normal = point.normal(&mesh.triangles, &mesh.positions, &mesh.normals);
             Placement::of(grid, *at, normal)
         };
         let mut places: Vec<Option<Placement>> = points.iter().zip(&local).map(place).collect();
         leave_room(&mut places);
-        let coded = |index: u32| {
-            let point = &points[index as usize];
-            let at = places[index as usize]?;
+        let coded = |(index, point): (usize, &SurfacePoint)| {
+            let at = places[index]?;
             let mut coded = PatchPoint {
                 normal: at.normal,
-                level: level_of_rank(index as usize, points.len()),
+                level: level_of_rank(index, points.len()),
                 ..PatchPoint::default()
             };
             for axis in 0..3 {
@@ -76,14 +73,17 @@ impl PointSet {
             }
             Some((coded, *point))
         };
-        let all: Vec<(PatchPoint, SurfacePoint)> = morton_order(&local, bounds)
-            .into_iter()
-            .filter_map(coded)
-            .collect();
-        let patches: Vec<(Vec<u8>, Vec<(PatchPoint, SurfacePoint)>)> = all
-            .par_chunks(PATCH_POINTS)
-            .map(|chunk| {
-                let mut chunk = chunk.to_vec();
+        let mut all: Vec<(PatchPoint, SurfacePoint)> =
+            points.iter().enumerate().filter_map(coded).collect();
+        let mut first_point = vec![0];
+        first_point.extend(gather(&mut all).iter().scan(0, |end, count| {
+            *end += count;
+            Some(*end)
+        }));
+        let patches: Vec<(Vec<u8>, Vec<(PatchPoint, SurfacePoint)>)> = first_point
+            .par_windows(2)
+            .map(|range| {
+                let mut chunk = all[range[0]..range[1]].to_vec();
                 let only: Vec<PatchPoint> = chunk.iter().map(|(coded, _)| *coded).collect();
                 let order = Order::of(&only);
                 chunk.sort_by_key(|(coded, _)| order.key(coded));
@@ -99,6 +99,7 @@ impl PointSet {
             patches: Vec::with_capacity(patches.len()),
             points: Vec::with_capacity(all.len()),
             coded: Vec::with_capacity(all.len()),
+            first_point,
             levels: Vec::new(),
             parts: HashMap::default(),
         };
@@ -146,8 +147,7 @@ impl PointSet {
 
     /// The points of a patch, as numbers within the set.
     pub fn patch_range(&self, patch: usize) -> Range<usize> {
-        let first = patch * PATCH_POINTS;
-        first..(first + PATCH_POINTS).min(self.coded.len())
+        self.first_point[patch]..self.first_point[patch + 1]
     }
 }
 
