@@ -3,18 +3,22 @@
 
 use crate::points::SurfacePoint;
 use psao_core::point::NORMALS;
-use psao_core::topology::{PATCH_POINTS, PatchPoint};
+use psao_core::topology::PatchPoint;
 use std::cmp::Reverse;
 
-/// As far apart count points that face opposite ways, in steps of 1/32 cell. A flat patch is some 15
+/// Most points of a patch. With twice as many more comes that is not seen, with half as many
+/// there are so many patches that what each costs by itself counts.
+pub const MOST: usize = 512;
+
+/// As far apart count points that face opposite ways, in steps of 1/32 cell. A flat patch is some 10
 /// cells long, so that sides are told apart long before places are.
 const OPPOSITE: f32 = 120.0 * 32.0;
 
 /// Few points that face another way are not worth a patch of their own.
-const LEAST: usize = 128;
+const LEAST: usize = 64;
 
 /// Puts points that make up a patch one behind the other, and says how many each has:
-/// [`PATCH_POINTS`] at most. The same on any number of threads.
+/// [`MOST`] at most. The same on any number of threads.
 pub fn gather(points: &mut [(PatchPoint, SurfacePoint)]) -> Vec<usize> {
     if points.is_empty() {
         return Vec::new();
@@ -32,7 +36,7 @@ pub fn gather(points: &mut [(PatchPoint, SurfacePoint)]) -> Vec<usize> {
             .min_by_key(|axis| Reverse(length(axis)))
             .unwrap_or(0)
     };
-    let fits = points.len() <= PATCH_POINTS;
+    let fits = points.len() <= MOST;
     let axis = longest(AXES);
     if fits && axis < POSITION_AXES {
         return vec![points.len()];
@@ -94,7 +98,7 @@ mod tests {
         assert_eq!(counts.iter().sum::<usize>(), points.len());
         let mut rest = points.as_slice();
         for count in counts {
-            assert!((LEAST..=PATCH_POINTS).contains(&count));
+            assert!((LEAST..=MOST).contains(&count));
             let patch = rest.split_off(..count).unwrap();
             assert!(patch.iter().all(|(p, _)| p.normal == patch[0].0.normal));
         }
@@ -102,22 +106,18 @@ mod tests {
 
     #[test]
     fn what_cannot_be_told_apart_is_divided_all_the_same() {
-        for count in [0, 1, PATCH_POINTS, PATCH_POINTS + 1, 5000] {
+        for count in [0, 1, MOST, MOST + 1, 5000] {
             let mut points = vec![point([7; 3], [0.0, 1.0, 0.0]); count];
             let counts = gather(&mut points);
             assert_eq!(counts.iter().sum::<usize>(), count);
-            assert!(
-                counts
-                    .iter()
-                    .all(|&count| (1..=PATCH_POINTS).contains(&count))
-            );
+            assert!(counts.iter().all(|&count| (1..=MOST).contains(&count)));
         }
     }
 
     #[test]
     fn few_points_that_face_another_way_stay_with_the_others() {
-        let normal = |i: u32| [0.0, if i < 900 { 1.0 } else { -1.0 }, 0.0];
-        let mut points: Vec<_> = (0..1000).map(|i| point([i, 0, 0], normal(i))).collect();
-        assert_eq!(gather(&mut points), [1000]);
+        let normal = |i: u32| [0.0, if i < 450 { 1.0 } else { -1.0 }, 0.0];
+        let mut points: Vec<_> = (0..500).map(|i| point([i, 0, 0], normal(i))).collect();
+        assert_eq!(gather(&mut points), [500]);
     }
 }
