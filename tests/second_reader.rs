@@ -748,13 +748,16 @@ fn begin_patch(data: &[u8]) -> Result<(Patch<'_>, u32, [u32; 3], usize), String>
         varint(data, &mut at)?,
         varint(data, &mut at)?,
     ];
-    let bits = data.get(at..at + 3).ok_or("15.6: length")?;
-    let bits = [bits[0], bits[1], bits[2]].map(u32::from);
+    let bytes = data.get(at..at + 4).ok_or("15.6: length")?;
+    let bits = [bytes[0], bytes[1], bytes[2]].map(u32::from);
+    let (highest, coarse) = (usize::from(bytes[3] % 4), u32::from(bytes[3] / 4));
     if !(1..=1024).contains(&count)
         || corner.iter().any(|corner| *corner >= 1 << 25)
         || bits.iter().any(|bits| *bits > 25)
+        || coarse > 4
+        || corner.iter().any(|corner| corner % (1 << coarse) != 0)
     {
-        return Err("15.6: points, corner or bits".into());
+        return Err("15.6: points, corner, bits or form".into());
     }
     // The axis that gives a bit at each depth.
     let mut order = Vec::new();
@@ -769,11 +772,13 @@ fn begin_patch(data: &[u8]) -> Result<(Patch<'_>, u32, [u32; 3], usize), String>
         order.push(axis);
     }
     let patch = Patch {
-        coder: Coder::new(&data[at + 3..]),
+        coder: Coder::new(&data[at + 4..]),
         odds: PATCH_TABLES.clone(),
         state: vec![0; order.len()],
         order,
         corner,
+        highest,
+        coarse,
         points: Vec::new(),
         offsets: Vec::new(),
         before: [7; 2],
@@ -781,7 +786,7 @@ fn begin_patch(data: &[u8]) -> Result<(Patch<'_>, u32, [u32; 3], usize), String>
         same: true,
         distance_bits: 0,
     };
-    Ok((patch, count, bits, at + 3))
+    Ok((patch, count, bits, at + 4))
 }
 
 /// A patch that is being read.
@@ -792,6 +797,9 @@ struct Patch<'a> {
     /// Of each depth.
     state: Vec<usize>,
     corner: [u32; 3],
+    /// The form: the highest level, and how many lowest bits are known along the surface.
+    highest: usize,
+    coarse: u32,
     points: Vec<PatchPoint>,
     offsets: Vec<[i64; 3]>,
     /// Normals: of the point before, and the last one that was another.
@@ -893,7 +901,7 @@ impl Patch<'_> {
             .last()
             .map_or(0, |point| usize::from(point.level));
         let mut level = 0;
-        while level < 3 && self.decide("level", row, level) {
+        while level < self.highest && self.decide("level", row, level) {
             level += 1;
         }
         let normal = self.read_normal()?;
@@ -910,8 +918,16 @@ impl Patch<'_> {
             .expect("one is the largest");
         let others: Vec<usize> = (0..3).filter(|axis| *axis != across).collect();
         let mut offset = known.map(i64::from);
-        for &axis in &others {
-            offset[axis] += i64::from(self.plain(left[axis]));
+        let bits = [0, 1].map(|i| left[others[i]].saturating_sub(self.coarse));
+        let numbers = if bits[0] + bits[1] <= 16 {
+            let both = self.plain(bits[0] + bits[1]);
+            [both >> bits[1], both % (1 << bits[1])]
+        } else {
+            [self.plain(bits[0]), self.plain(bits[1])]
+        };
+        for (axis, number) in others.iter().zip(numbers) {
+            let known = [0, 1, 2, 4, 8][self.coarse as usize] % (1i64 << left[*axis]);
+            offset[*axis] += (i64::from(number) << self.coarse) + known;
         }
         if left[across] > 0 {
             let low = offset[across];

@@ -115,7 +115,7 @@ impl TraceArgs {
     pub fn world(
         &self,
         scene: &SceneArgs,
-        rest_space: bool,
+        layout: Layout,
         progress: Progress<'_>,
     ) -> Result<World, String> {
         #[cfg(not(feature = "gpu"))]
@@ -126,7 +126,7 @@ impl TraceArgs {
                     .into(),
             );
         }
-        let world = scene.world(rest_space, progress)?;
+        let world = scene.world(layout, progress)?;
         #[cfg(feature = "gpu")]
         if self.trace == DeviceArg::Gpu {
             let mut world = world;
@@ -236,19 +236,45 @@ impl SceneArgs {
     ///
     /// # Errors
     /// What is wrong with a file or an option, and what to do.
-    pub fn world(&self, rest_space: bool, progress: Progress<'_>) -> Result<World, String> {
+    pub fn world(&self, layout: Layout, progress: Progress<'_>) -> Result<World, String> {
         let options = Options {
-            rest_space,
+            rest_space: layout != Layout::Cells,
+            levels: layout == Layout::Levels,
             ..self.options()?
         };
         World::new(self.load()?, options, progress).map_err(|error| error.to_string())
     }
 }
 
+/// How a world's points are laid out.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Layout {
+    /// Each instance's in cells, for profile `cells`.
+    Cells,
+    /// A mesh's for all its instances, for profile `residual`.
+    Patches,
+    /// The same in levels of detail.
+    Levels,
+}
+
+impl Layout {
+    /// For profile `residual`: with levels of detail or without.
+    pub fn of_patches(levels: bool) -> Layout {
+        if levels {
+            Layout::Levels
+        } else {
+            Layout::Patches
+        }
+    }
+}
+
 impl StreamArgs {
-    /// The profile needs the points of deforming instances in rest space.
-    pub fn rest_space(&self) -> bool {
-        self.profile == ProfileArg::Residual
+    /// How points are to be laid out for the profile.
+    pub fn layout(&self) -> Layout {
+        match self.profile {
+            ProfileArg::Cells => Layout::Cells,
+            ProfileArg::Residual => Layout::of_patches(self.points_per_pixel > 0.0),
+        }
     }
 
     /// How frames are made.

@@ -1,7 +1,7 @@
 //! `psao bench-gpu`: the lookup against what an engine would use in its place, over the same
 //! G-buffers, in milliseconds of the GPU and in error against ray-traced pictures.
 
-use crate::args::{SceneArgs, camera_path};
+use crate::args::{Layout, SceneArgs, camera_path};
 use crate::camera::Frustum;
 use crate::demo::parse_size;
 use crate::encode::{Encoder, Limits, Scheme, View as Sight, capacity_of};
@@ -209,7 +209,7 @@ pub fn run(args: &BenchGpuArgs, progress: Progress<'_>) -> Result<Race, String> 
     };
     let gpu = Gpu::open_with(experimental)?;
     let mut watch = Stopwatch::new(&gpu)?;
-    let mut world = args.scene.world(true, progress)?;
+    let mut world = args.scene.world(Layout::Patches, progress)?;
     let size = [args.size.0 as u32, args.size.1 as u32];
     let path = camera_path(&world, args.path, args.size.0 as f32 / args.size.1 as f32)?;
     let time_of = |frame: u32| f64::from(frame) * STEP_S;

@@ -1,6 +1,6 @@
 //! `psao serve`, `record`, `play` and `inspect`.
 
-use crate::args::{SceneArgs, StreamArgs, TraceArgs, camera_path};
+use crate::args::{Layout, SceneArgs, StreamArgs, TraceArgs, camera_path};
 use crate::camera::Frustum;
 use crate::encode::{Encoder, Eye, View, least_capacity};
 use crate::identity::Identity;
@@ -121,7 +121,7 @@ pub fn serve(args: &ServeArgs, out: &mut dyn Write, progress: Progress<'_>) -> R
     let settings = args.stream.settings()?;
     let identity = Identity::load_or_create(&args.identity).map_err(|e| e.to_string())?;
     let fingerprint = identity.fingerprint();
-    let world = (args.trace).world(&args.scene, args.stream.rest_space(), progress)?;
+    let world = (args.trace).world(&args.scene, args.stream.layout(), progress)?;
     let mut server = Server::new(world, settings);
     let mut transport = Transport::start(TransportConfig {
         listen: args.listen,
@@ -169,7 +169,7 @@ pub fn record(args: &RecordArgs, progress: Progress<'_>) -> Result<u64, String> 
     if args.frames == 0 {
         return Err("--frames must be 1 or more".into());
     }
-    if args.topology && !args.stream.rest_space() {
+    if args.topology && args.stream.layout() == Layout::Cells {
         return Err("--topology needs --profile residual".into());
     }
     let error = |error: std::io::Error| {
@@ -200,7 +200,7 @@ fn record_to(
     error: &dyn Fn(std::io::Error) -> String,
 ) -> Result<u64, String> {
     let settings = args.stream.settings()?;
-    let mut world = (args.trace).world(&args.scene, args.stream.rest_space(), progress)?;
+    let mut world = (args.trace).world(&args.scene, args.stream.layout(), progress)?;
     let path = args
         .path
         .map(|which| camera_path(&world, which, 16.0 / 9.0))

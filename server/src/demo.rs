@@ -170,7 +170,7 @@ pub fn run(args: &DemoArgs, progress: Progress<'_>) -> Result<Figures, String> {
             .map_err(|error| format!("{}: {error}: choose another place for it", path.display()))?;
     }
     let start = Instant::now();
-    let mut world = (args.trace).world(&args.scene, args.stream.rest_space(), progress)?;
+    let mut world = (args.trace).world(&args.scene, args.stream.layout(), progress)?;
     let aspect = args.size.0 as f32 / args.size.1 as f32;
     let path = camera_path(&world, args.path, aspect)?;
     let time_of = |frame: u32| f64::from(frame) / f64::from(args.stream.fps);

@@ -9,7 +9,7 @@ pub mod convergence;
 pub mod kernels;
 mod variants;
 
-use crate::args::{PlacementArg, ProfileArg, SceneArgs, camera_path};
+use crate::args::{Layout, PlacementArg, ProfileArg, SceneArgs, camera_path};
 use crate::camera::{CameraPath, Frustum};
 use crate::demo::parse_size;
 use crate::encode::{Compression, Encoder, Eye, Limits, Scheme, View as Sight, capacity_of};
@@ -343,7 +343,13 @@ impl Bench<'_> {
             ..args.scene.clone()
         };
         let placing = |name: &str, done, total| progress(&stage(name), done, total);
-        let mut world = scene.world(profile == ProfileArg::Residual, &placing)?;
+        let layout = match profile {
+            ProfileArg::Cells => Layout::Cells,
+            ProfileArg::Residual => {
+                Layout::of_patches(args.points_per_pixel.iter().any(|&p| p > 0.0))
+            }
+        };
+        let mut world = scene.world(layout, &placing)?;
         // Streams in a group are measured side by side: those that keep the same points.
         let groups: Vec<Vec<Scheme>> = match profile {
             ProfileArg::Cells => vec![vec![CELLS]],

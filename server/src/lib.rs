@@ -14,6 +14,7 @@ pub mod facing;
 #[cfg(feature = "gpu")]
 pub mod gpu;
 pub mod identity;
+pub mod lattice;
 pub mod metrics;
 pub mod picture;
 pub mod points;

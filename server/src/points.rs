@@ -8,6 +8,7 @@
 mod eliminate;
 pub mod pilot;
 
+use crate::lattice::Lattice;
 use crate::scene::Mesh;
 use eliminate::{Sample, eliminate};
 use glam::{DVec3, Vec3};
@@ -164,28 +165,20 @@ pub fn generate(
     density: f64,
     seed: u64,
 ) -> Result<PointSet, PointError> {
-    spread_over(mesh, metric, density, None, seed)
+    generate_with(mesh, metric, density, None, None, seed)
 }
 
-/// As [`generate`], denser here than there; how many points there are depends on it too.
+/// As [`generate`]; with `factors` denser here than there, on which depends how many points there
+/// are; with a `lattice` on its places where they can.
 ///
 /// # Errors
 /// As [`generate`].
-pub fn generate_adaptive(
-    mesh: &Mesh,
-    metric: Vec3,
-    density: f64,
-    factors: &Density,
-    seed: u64,
-) -> Result<PointSet, PointError> {
-    spread_over(mesh, metric, density, Some(factors), seed)
-}
-
-fn spread_over(
+pub fn generate_with(
     mesh: &Mesh,
     metric: Vec3,
     density: f64,
     factors: Option<&Density>,
+    lattice: Option<&Lattice<'_>>,
     seed: u64,
 ) -> Result<PointSet, PointError> {
     if !(density.is_finite() && density > 0.0) {
@@ -241,6 +234,11 @@ fn spread_over(
         let back = candidates.iter().find(|c| c.back);
         let points = front.into_iter().chain(back).copied().collect();
         return Ok(PointSet { points, area_m2 });
+    }
+    if let Some(lattice) = lattice {
+        // Before elimination, which evens out what this does to their distances.
+        let settle = |c: &mut SurfacePoint| *c = lattice.settle(*c);
+        candidates.par_iter_mut().for_each(settle);
     }
     let mut samples = samples(mesh, metric, &candidates);
     for (sample, factor) in samples.iter_mut().zip(of_candidates) {
@@ -349,25 +347,26 @@ fn strew(mesh: &Mesh, areas: &Areas, sides: u32, per_side: u32, seed: u64) -> Ve
             back: k >= u64::from(per_side),
         }
     };
-    let in_hole = |point: &SurfacePoint| {
-        let mask = mesh.mask.as_ref().filter(|_| !mesh.uvs.is_empty());
-        mask.is_some_and(|mask| {
-            let [t0, t1, t2] =
-                mesh.triangles[point.triangle as usize].map(|i| mesh.uvs[i as usize]);
-            mask.is_hole(t0 + point.u * (t1 - t0) + point.v * (t2 - t0))
-        })
-    };
     let count = per_side * sides;
     let runs: Vec<Vec<SurfacePoint>> = (0..count.div_ceil(RUN))
         .into_par_iter()
         .map(|r| {
             let run = r * RUN..((r + 1) * RUN).min(count);
             run.map(|k| one(u64::from(k)))
-                .filter(|point| !in_hole(point))
+                .filter(|point| !in_hole(mesh, point))
                 .collect()
         })
         .collect();
     runs.concat()
+}
+
+/// The mask has a hole there.
+pub fn in_hole(mesh: &Mesh, point: &SurfacePoint) -> bool {
+    let mask = mesh.mask.as_ref().filter(|_| !mesh.uvs.is_empty());
+    mask.is_some_and(|mask| {
+        let [t0, t1, t2] = mesh.triangles[point.triangle as usize].map(|i| mesh.uvs[i as usize]);
+        mask.is_hole(t0 + point.u * (t1 - t0) + point.v * (t2 - t0))
+    })
 }
 
 /// A well-mixed 64-bit value for each input (the finalizer of SplitMix64).

@@ -1,6 +1,7 @@
 //! Topology of profile `residual`: each mesh's points once, in patches that its instances share.
 
 use crate::clusters::gather;
+use crate::lattice;
 use crate::points::SurfacePoint;
 use crate::scene::Mesh;
 use crate::truth::{Placement, buckets_for, choose_buckets};
@@ -49,28 +50,24 @@ pub struct Level {
 
 impl PointSet {
     /// Patches of a mesh's points, which come in progressive order; `grid` is that of level 0,
-    /// around all of them. `None` if there are no points.
-    pub fn new(mesh: &Mesh, points: &[SurfacePoint], grid: &Instance) -> Option<PointSet> {
-        let local: Vec<Vec3> = points
-            .iter()
-            .map(|p| p.position(&mesh.triangles, &mesh.positions))
-            .collect();
-        let place = |(point, at): (&SurfacePoint, &Vec3)| {
-            let normal = point.normal(&mesh.triangles, &mesh.positions, &mesh.normals);
-            Placement::of(grid, *at, normal)
-        };
-        let mut places: Vec<Option<Placement>> = points.iter().zip(&local).map(place).collect();
+    /// around all of them, and `highest` the last level. `None` if there are no points.
+    pub fn new(
+        mesh: &Mesh,
+        points: &[SurfacePoint],
+        grid: &Instance,
+        highest: u32,
+    ) -> Option<PointSet> {
+        let place = |point| lattice::place(mesh, grid, point);
+        let mut places: Vec<Option<Placement>> = points.iter().map(place).collect();
         leave_room(&mut places);
         let coded = |(index, point): (usize, &SurfacePoint)| {
             let at = places[index]?;
             let mut coded = PatchPoint {
                 normal: at.normal,
-                level: level_of_rank(index, points.len()),
+                level: level_of_rank(index, points.len(), highest),
                 ..PatchPoint::default()
             };
-            for axis in 0..3 {
-                coded.position[axis] = at.cell[axis] * 32 + at.position[axis];
-            }
+            coded.position = at.steps();
             Some((coded, *point))
         };
         let mut all: Vec<(PatchPoint, SurfacePoint)> =
@@ -110,7 +107,7 @@ impl PointSet {
                 set.points.push(point);
             }
         }
-        set.levels = (0..LEVELS)
+        set.levels = (0..=highest)
             .into_par_iter()
             .map(|level| lay_out(&set.coded, grid, level))
             .collect();
@@ -167,9 +164,9 @@ fn leave_room(places: &mut [Option<Placement>]) {
 }
 
 /// The highest level that has a point: each level has half of the points of the one below.
-fn level_of_rank(rank: usize, count: usize) -> u8 {
+fn level_of_rank(rank: usize, count: usize, highest: u32) -> u8 {
     let has = |level: &u32| rank < count.div_ceil(1 << level);
-    (1..LEVELS).take_while(has).count() as u8
+    (1..=highest).take_while(has).count() as u8
 }
 
 /// A level's grid, with buckets for the cells that its points fall into.
@@ -401,7 +398,8 @@ mod tests {
     #[test]
     fn each_level_has_half_of_the_points_of_the_one_below() {
         let counts = |count: usize| -> Vec<usize> {
-            let levels: Vec<u8> = (0..count).map(|rank| level_of_rank(rank, count)).collect();
+            let level = |rank| level_of_rank(rank, count, LEVELS - 1);
+            let levels: Vec<u8> = (0..count).map(level).collect();
             (0..LEVELS as u8)
                 .map(|level| levels.iter().filter(|&&l| l >= level).count())
                 .collect()

@@ -61,6 +61,20 @@ impl Placement {
         placement.normal = encode_normal((normal * Vec3::from(grid.normal_scale)).to_array());
         Some(placement)
     }
+
+    /// From steps of 1/32 of a cell.
+    pub fn at(steps: [u32; 3], normal: u8) -> Placement {
+        Placement {
+            cell: steps.map(|s| s >> 5),
+            position: steps.map(|s| s & 31),
+            normal,
+        }
+    }
+
+    /// The position, in steps of 1/32 of a cell from the grid's corner.
+    pub fn steps(&self) -> [u32; 3] {
+        std::array::from_fn(|axis| self.cell[axis] << 5 | self.position[axis])
+    }
 }
 
 /// A grid around `bounds` (local space) with cells of `cell_m` metres and a margin of one cell.

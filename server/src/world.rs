@@ -64,6 +64,9 @@ pub struct Options {
     /// ([`Topology`]). Else each instance has its own in cells ([`Truth`]), and those of deforming
     /// instances move through the cells of the posed local space, as in the paper.
     pub rest_space: bool,
+    /// In rest space, clients may ask for levels of detail. Which level a point has costs bits, so
+    /// without this it has one only where instances of different size share a mesh.
+    pub levels: bool,
 }
 
 impl Options {
@@ -86,6 +89,7 @@ impl Options {
             adaptive: false,
             seed: 1,
             rest_space: false,
+            levels: false,
         }
     }
 
@@ -357,16 +361,20 @@ impl World {
         let total = sets.len() as u64;
         let done = std::sync::atomic::AtomicU64::new(0);
         let mut of_instance = vec![None; self.scene.instances.len()];
+        // The fewest points that are not much fewer than asked for.
+        let level_of = |share: f32| {
+            let few = |level: &u32| 0.5f32.powi(*level as i32) > 0.75 * share;
+            (1..LEVELS).take_while(few).count() as u32
+        };
         let made: Vec<Option<PointSet>> = sets
             .par_iter()
             .map(|sampled| {
+                let asked = sampled.users.iter();
+                let asked = asked.map(|(_, scale)| level_of(sampled.share(*scale)));
+                let all = self.options.levels.then_some(LEVELS - 1);
+                let highest = asked.chain(all).max().unwrap_or(0);
                 let mesh = &self.scene.meshes[sampled.mesh as usize];
-                let positions = sampled.points.iter();
-                let bounds =
-                    bounds_of(positions.map(|p| p.position(&mesh.triangles, &mesh.positions)));
-                let (cell_m, radius) = (self.options.cell_m(), 1.0 / self.options.cell_over_radius);
-                let grid = fit(bounds, sampled.scale, cell_m, radius)?;
-                let set = PointSet::new(mesh, &sampled.points, &grid);
+                let set = PointSet::new(mesh, &sampled.points, &sampled.grid?, highest);
                 let so_far = done.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
                 progress("topology", so_far + 1, total);
                 set
@@ -376,11 +384,8 @@ impl World {
         for (sampled, set) in sets.iter().zip(made) {
             let Some(set) = set else { continue };
             for &(instance, scale) in &sampled.users {
-                let share = sampled.share(scale);
-                // The fewest that are not much fewer than asked for.
-                let level =
-                    (1..LEVELS).take_while(|level| 0.5f32.powi(*level as i32) > 0.75 * share);
-                of_instance[instance as usize] = Some((kept.len() as u32, level.count() as u32));
+                let level = level_of(sampled.share(scale));
+                of_instance[instance as usize] = Some((kept.len() as u32, level));
             }
             kept.push(set);
         }
@@ -1328,7 +1333,15 @@ impl World {
         own.map(|(_, level)| level)
     }
 
-    /// In rest space: an instance's grid at a level of detail, not below [`World::level_of`].
+    /// In rest space: the coarsest level of detail that an instance can have; 0 if it has no
+    /// points.
+    pub fn coarsest(&self, instance: u32) -> u32 {
+        let set = self.topology.set_of(instance);
+        set.map_or(0, |set| set.levels.len() as u32 - 1)
+    }
+
+    /// In rest space: an instance's grid at a level of detail, not below [`World::level_of`] and
+    /// not above [`World::coarsest`].
     pub fn grid(&self, instance: u32, level: u32) -> Instance {
         let own = self.truth.instances[instance as usize];
         let Some(set) = self.topology.set_of(instance) else {

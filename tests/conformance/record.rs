@@ -86,7 +86,7 @@ pub fn record(name: &str) -> Vec<u8> {
         }
         "reopen" => {
             let scene = still_scene;
-            let need = capacity_of(&world(scene(), 400.0, true));
+            let need = capacity_of(&world(scene(), 400.0, plain));
             let limits = Limits {
                 points: need.points * 6 / 10,
                 ..Limits::default()
@@ -113,15 +113,16 @@ pub fn record(name: &str) -> Vec<u8> {
     }
 }
 
-fn world(scene: Scene, density: f64, rest_space: bool) -> World {
-    let kernel = match rest_space {
-        true => Kernel::Planar,
-        false => Kernel::Paper,
+fn world(scene: Scene, density: f64, scheme: Scheme) -> World {
+    let (kernel, rest_space, levels) = match scheme {
+        Scheme::Residual(_, limits) => (Kernel::Planar, true, limits.points_per_pixel > 0.0),
+        _ => (Kernel::Paper, false, false),
     };
     let options = Options {
         density,
         rays: 32,
         rest_space,
+        levels,
         ..Options::of(kernel)
     };
     World::new(scene, options, &|_, _, _| ()).unwrap()
@@ -148,7 +149,7 @@ struct Take {
 
 impl Take {
     fn new(scene: Scene, density: f64, scheme: Scheme, knows: fn(&World) -> u64) -> Take {
-        let world = world(scene, density, matches!(scheme, Scheme::Residual(..)));
+        let world = world(scene, density, scheme);
         let mut encoder = Encoder::new(&world, scheme, knows(&world));
         let out = encoder.header(&world, 0x5ce4e, RATE_HZ);
         Take {

@@ -3,7 +3,7 @@
 use crate::samples::{MADE_LARGE, Random, agreed_on, made, patch_of, point, varint};
 use crate::second_reader;
 use psao::core::residual::{Neighbours, find_neighbours};
-use psao::core::topology::{Order, PATCH_POINTS, PatchPoint, decode_patch};
+use psao::core::topology::{Order, PATCH_POINTS, PatchPoint, across, decode_patch, settled};
 use std::collections::BTreeMap;
 
 #[test]
@@ -87,14 +87,22 @@ fn patches_of_any_shape_read_back_as_they_were_written() {
         [1, all, 1],
     ] {
         for count in [1, 2, 3, 4, 5, 16, 17, 40, 1023, 1024] {
-            for rough in [1, 15] {
+            for (rough, shift) in [(1, 0), (15, 0), (1, 3), (15, 1), (15, 4)] {
                 let corner = extent.map(|extent| random.below(all - extent + 1));
                 let turn = random.below(15);
                 let points: Vec<PatchPoint> = (0..count)
                     .map(|_| {
                         let mut code = || ((turn + random.below(rough)) % 15) as u8;
                         let normal = code() | code() << 4;
-                        let at = |axis: usize| (corner[axis] + random.below(extent[axis])) as u32;
+                        let across = across(normal);
+                        let at = |axis: usize| {
+                            let at = (corner[axis] + random.below(extent[axis])) as u32;
+                            if axis == across {
+                                at
+                            } else {
+                                settled(at, shift)
+                            }
+                        };
                         PatchPoint {
                             position: [0, 1, 2].map(at),
                             normal,
@@ -112,14 +120,17 @@ fn patches_of_any_shape_read_back_as_they_were_written() {
     }
 }
 
-/// Any decisions, for `count` points in a box of so many bits.
-fn any_patch(random: &mut Random, count: u32, bits: [u8; 3]) -> Vec<u8> {
+/// Any decisions, for `count` points in a box of so many bits, whose form is that byte.
+fn any_patch(random: &mut Random, count: u32, bits: [u8; 3], form: u8) -> Vec<u8> {
     let mut data = varint(count);
     for bits in bits {
         let most = (1 << 25) - if bits < 25 { 1usize << bits } else { 0 };
-        data.extend(varint(random.below(most) as u32));
+        data.extend(varint(
+            random.below(most) as u32 >> (form >> 2) << (form >> 2),
+        ));
     }
     data.extend(bits);
+    data.push(form);
     // Bits of a kind now and then, so that what is seldom comes too.
     while data.len() < 10_000 {
         let byte = [0, 0xff, random.below(256) as u8][random.below(16).min(2)];
@@ -142,7 +153,8 @@ fn patches_that_no_encoder_writes_are_read_or_refused_by_both_readers_for_each_r
             _ => (17, 6),
         };
         let bits = [0; 3].map(|_| random.below(most + 1) as u8);
-        let random_data = any_patch(&mut random, count as u32, bits);
+        let form = [0, random.below(20) as u8][round / 4 % 2];
+        let random_data = any_patch(&mut random, count as u32, bits, form);
         let data = second_reader::patch_with_right_end(&random_data).unwrap();
         let read = patch_read(&data);
         let reason = read.map_or_else(
@@ -175,7 +187,7 @@ fn patches_outside_their_limits_are_refused() {
     let refused = |data: &[u8], clause: &str| {
         assert_eq!(patch_read(data).unwrap_err(), clause, "{data:?}");
     };
-    let limits = "15.6: points, corner or bits";
+    let limits = "15.6: points, corner, bits or form";
     let one = patch_of(&[point([5, 6, 7], 0)]);
     let points = patch_read(&one).unwrap();
     assert_eq!(points, [point([5, 6, 7], 0)]);
@@ -204,7 +216,15 @@ fn patches_outside_their_limits_are_refused() {
         assert!(patch_read(&with(most - 1)).is_ok());
         refused(&with(most), "15.6: position");
     }
-    for length in 0..7 {
+    // Half a cell is the longest lattice, on which a corner has to lie.
+    let with = |corner: [u8; 3], shift: u8| {
+        let form = shift << 2;
+        [&[1], &corner[..], &rest[..3], &[form], &rest[4..]].concat()
+    };
+    assert!(patch_read(&with([0, 16, 32], 4)).is_ok());
+    refused(&with([0, 16, 32], 5), limits);
+    refused(&with([0, 16, 8], 4), limits);
+    for length in 0..8 {
         assert!(patch_read(&one[..length]).is_err(), "{length} bytes");
     }
     refused(&[&one[..], &[0]].concat(), "15.9: end of the data");

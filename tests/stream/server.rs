@@ -42,6 +42,7 @@ impl Watched {
             density,
             rays: 128,
             rest_space: true,
+            levels: limits.points_per_pixel > 0.0,
             ..Options::of(psao::core::Kernel::Planar)
         };
         let world = World::new(scene, options, &|_, _, _| ()).unwrap();

@@ -367,7 +367,7 @@ fn patches_that_do_not_fit_are_refused() {
     assert_eq!(opened(&longer).clause.unwrap(), "15.9: end of the data");
     assert_eq!(
         opened(&[0; 8]).clause.unwrap(),
-        "15.6: points, corner or bits"
+        "15.6: points, corner, bits or form"
     );
     assert!(opened(&data[..5]).error.is_some());
 

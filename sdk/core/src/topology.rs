@@ -3,6 +3,7 @@
 //! A patch is coded by one function, the same for writer and reader. It is halved again
 //! and again, and how many points each half has is coded, until a part has one point. What is left
 //! of that point's position is plain along the surface, and predicted from its normal across it.
+//! Along the surface positions may be coarser: all those of a lattice ([`settled`]).
 #![deny(
     clippy::unwrap_used,
     clippy::panic,
@@ -39,6 +40,36 @@ pub struct PatchPoint {
     pub level: u8,
     /// Zero.
     pub reserved: [u8; 2],
+}
+
+/// Longest lattice of a patch, as a power of two: half a cell.
+pub const MOST_SHIFT: u32 = 4;
+
+/// The axis across the surface: that on which a normal's code is longest, the first of equals.
+pub fn across(normal: u8) -> usize {
+    let steps = NORMAL_STEPS.get(usize::from(normal)).copied();
+    let [x, y, z] = steps.unwrap_or_default().map(i32::unsigned_abs);
+    if x >= y && x >= z {
+        0
+    } else if y >= z {
+        1
+    } else {
+        2
+    }
+}
+
+/// The position of a lattice that stands for this one, along an axis: all that differ in the
+/// lowest `shift` bits alone (at most [`MOST_SHIFT`]) have the one in their middle in common.
+///
+/// A patch of which all points are settled, along the two axes that are not [`across`], costs
+/// `2 * shift` bits a point less.
+pub fn settled(position: u32, shift: u32) -> u32 {
+    let low = low_bits(shift);
+    position & !low | low.div_ceil(2)
+}
+
+fn low_bits(count: u32) -> u32 {
+    1u32.checked_shl(count).unwrap_or(0).wrapping_sub(1)
 }
 
 /// The order of a patch's points: by the bits of their positions, the highest first.
@@ -83,7 +114,8 @@ pub fn encode_patch(points: &[PatchPoint], out: &mut [u8]) -> Result<usize, Full
     let head = |w: &mut Writer<'_>| {
         w.varint(points.len() as u32)?;
         frame.origin.into_iter().try_for_each(|v| w.varint(v))?;
-        w.bytes(&frame.bits)
+        w.bytes(&frame.bits)?;
+        w.bytes(&[frame.highest | (frame.shift as u8) << 2])
     };
     head(&mut w).map_err(|_| Full)?;
     let start = w.length();
@@ -105,7 +137,7 @@ pub fn decode_patch(bytes: &[u8], points: &mut [PatchPoint]) -> Result<usize, St
         return Err(StreamError::Value);
     }
     let origin = [r.varint()?, r.varint()?, r.varint()?];
-    let frame = Frame::new(origin, r.array()?)?;
+    let frame = Frame::new(origin, r.array()?, r.array()?)?;
     let points = points.get_mut(..count).ok_or(StreamError::Length)?;
     let mut side = Decode(Decoder::new(r.0));
     code_points(&mut side, &frame, points)?;
@@ -120,6 +152,10 @@ const DEPTHS: usize = 3 * POSITION_BITS as usize;
 struct Frame {
     origin: [u32; 3],
     bits: [u8; 3],
+    /// The highest level that a point has.
+    highest: u8,
+    /// The lattice that all points are settled on.
+    shift: u32,
     /// For each depth, the highest first: the axis, and the bits of every axis below it.
     order: [(u8, [u8; 3]); DEPTHS],
     depths: usize,
@@ -133,13 +169,24 @@ impl Frame {
                 [with(a, x), with(b, y), with(c, z)]
             })
         };
-        let (min, max) = (fold(u32::min, u32::MAX), fold(u32::max, 0));
-        let ([a, b, c], [x, y, z]) = (min, max);
+        let fits = |shift: &u32| {
+            points.iter().all(|point| {
+                let mut axes = point.position.iter().enumerate();
+                let across = across(point.normal);
+                axes.all(|(axis, at)| axis == across || settled(*at, *shift) == *at)
+            })
+        };
+        let shift = (1..=MOST_SHIFT).rev().find(fits).unwrap_or(0);
+        // So that offsets are settled as positions are.
+        let min = fold(u32::min, u32::MAX).map(|least| least & !low_bits(shift));
+        let ([a, b, c], [x, y, z]) = (min, fold(u32::max, 0));
         let bits =
             |from: u32, to: u32| 32u32.saturating_sub((to.wrapping_sub(from)).leading_zeros());
         let mut frame = Frame {
             origin: min,
             bits: [bits(a, x) as u8, bits(b, y) as u8, bits(c, z) as u8],
+            highest: points.iter().map(|point| point.level).max().unwrap_or(0),
+            shift,
             order: [(0, [0; 3]); DEPTHS],
             depths: 0,
         };
@@ -147,16 +194,20 @@ impl Frame {
         frame
     }
 
-    fn new(origin: [u32; 3], bits: [u8; 3]) -> Result<Frame, StreamError> {
+    fn new(origin: [u32; 3], bits: [u8; 3], [form]: [u8; 1]) -> Result<Frame, StreamError> {
+        let (highest, shift) = (form & 3, u32::from(form >> 2));
         let fits = |(&from, &bits): (&u32, &u8)| {
             u32::from(bits) <= POSITION_BITS && from >> POSITION_BITS == 0
         };
-        if !origin.iter().zip(&bits).all(fits) {
+        let settled = origin.iter().all(|from| from & low_bits(shift) == 0);
+        if shift > MOST_SHIFT || !settled || !origin.iter().zip(&bits).all(fits) {
             return Err(StreamError::Value);
         }
         let mut frame = Frame {
             origin,
             bits,
+            highest,
+            shift,
             order: [(0, [0; 3]); DEPTHS],
             depths: 0,
         };
@@ -269,6 +320,17 @@ fn plain<S: Side>(side: &mut S, count: u32, wanted: u32) -> u32 {
     high.checked_shl(lower).unwrap_or(0) | side.bits(lower, wanted)
 }
 
+/// Two plain numbers; as one if that is short enough, as each costs a division.
+fn plain_pair<S: Side>(side: &mut S, counts: [u32; 2], wanted: [u32; 2]) -> [u32; 2] {
+    let ([first, second], [upper, lower]) = (wanted, counts);
+    if upper.saturating_add(lower) > 16 {
+        return [plain(side, upper, first), plain(side, lower, second)];
+    }
+    let both = first << lower | second & low_bits(lower);
+    let both = side.bits(upper.wrapping_add(lower), both);
+    [both >> lower, both & low_bits(lower)]
+}
+
 /// The odds of all kinds of decisions; they start anew with every patch.
 struct Contexts {
     /// A part of the patch has points on both sides of its middle: by how long it is, how many
@@ -303,74 +365,74 @@ impl Contexts {
     const START: Contexts = Contexts {
         both: [
             [
-                odds([117, 127, 126, 127]),
-                odds([128, 128, 128, 128]),
-                odds([128, 128, 128, 128]),
-            ],
-            [
-                odds([118, 126, 116, 123]),
-                odds([128, 128, 128, 128]),
+                odds([15, 108, 3, 3]),
+                odds([128, 128, 94, 128]),
                 odds([128, 128, 128, 128]),
             ],
             [
-                odds([118, 125, 114, 104]),
-                odds([128, 128, 129, 129]),
+                odds([26, 122, 11, 5]),
+                odds([128, 128, 105, 114]),
                 odds([128, 128, 128, 128]),
             ],
             [
-                odds([170, 209, 111, 122]),
-                odds([132, 176, 155, 149]),
+                odds([55, 129, 19, 21]),
+                odds([145, 135, 140, 118]),
                 odds([128, 128, 128, 128]),
             ],
             [
-                odds([154, 209, 137, 158]),
-                odds([182, 249, 183, 196]),
-                odds([142, 250, 212, 213]),
+                odds([132, 137, 103, 103]),
+                odds([180, 184, 146, 173]),
+                odds([128, 128, 136, 128]),
             ],
             [
-                odds([82, 163, 17, 13]),
-                odds([162, 243, 71, 88]),
-                odds([206, 253, 99, 147]),
+                odds([167, 199, 92, 121]),
+                odds([191, 246, 168, 194]),
+                odds([198, 249, 206, 208]),
             ],
             [
-                odds([92, 56, 17, 22]),
-                odds([91, 122, 24, 36]),
-                odds([183, 248, 74, 142]),
+                odds([67, 143, 20, 20]),
+                odds([155, 234, 63, 68]),
+                odds([225, 250, 104, 128]),
             ],
             [
-                odds([110, 67, 53, 99]),
-                odds([112, 84, 39, 83]),
-                odds([151, 219, 87, 125]),
+                odds([40, 55, 11, 16]),
+                odds([61, 110, 20, 22]),
+                odds([191, 233, 80, 98]),
             ],
             [
-                odds([123, 116, 109, 121]),
-                odds([123, 108, 98, 118]),
-                odds([165, 183, 74, 121]),
+                odds([82, 18, 9, 26]),
+                odds([54, 58, 11, 29]),
+                odds([165, 207, 70, 106]),
             ],
             [
-                odds([127, 126, 123, 127]),
-                odds([126, 124, 124, 127]),
-                odds([205, 101, 66, 113]),
+                odds([128, 32, 21, 71]),
+                odds([114, 27, 14, 49]),
+                odds([171, 168, 75, 117]),
             ],
             [
-                odds([128, 128, 127, 128]),
-                odds([128, 127, 126, 128]),
-                odds([182, 101, 96, 120]),
+                odds([145, 67, 61, 111]),
+                odds([128, 53, 52, 90]),
+                odds([197, 103, 56, 93]),
             ],
             [
-                odds([128, 128, 128, 128]),
-                odds([128, 128, 128, 128]),
-                odds([147, 122, 123, 127]),
+                odds([128, 128, 99, 128]),
+                odds([157, 120, 111, 128]),
+                odds([206, 55, 49, 60]),
             ],
             [
                 odds([128, 128, 128, 128]),
                 odds([128, 128, 128, 128]),
-                odds([131, 127, 127, 128]),
+                odds([220, 40, 83, 137]),
             ],
             [
                 odds([128, 128, 128, 128]),
                 odds([128, 128, 128, 128]),
+                odds([185, 128, 114, 128]),
+            ],
+            [
                 odds([128, 128, 128, 128]),
+                odds([128, 128, 128, 128]),
+                odds([136, 128, 128, 128]),
             ],
             [
                 odds([128, 128, 128, 128]),
@@ -428,13 +490,7 @@ impl Contexts {
                 odds([128, 128, 128, 128]),
             ],
         ],
-        above: odds([156, 115, 32, 232]),
-        many: odds([
-            128, 142, 140, 130, 238, 153, 227, 211, 153, 45, 32, 100, 44, 105, 145, 151,
-        ]),
-        same: odds([253, 142]),
-        turn_some: odds([205, 253, 179]),
-        turn_down: odds([118, 129]),
+        above: odds([138, 114, 37, 197]),
         few: [
             odds([
                 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128,
@@ -446,94 +502,100 @@ impl Contexts {
                 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128,
             ]),
             odds([
-                128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128,
+                128, 129, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128,
             ]),
             odds([
-                128, 204, 61, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128,
+                128, 209, 57, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128,
             ]),
             odds([
-                128, 222, 121, 34, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128,
+                128, 224, 130, 34, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128,
             ]),
             odds([
-                128, 222, 195, 82, 40, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128,
+                128, 220, 194, 88, 37, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128,
             ]),
             odds([
-                128, 248, 207, 125, 56, 42, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128,
+                128, 250, 212, 129, 51, 46, 128, 128, 128, 128, 128, 128, 128, 128, 128, 128,
             ]),
             odds([
-                128, 246, 223, 193, 87, 20, 70, 128, 128, 128, 128, 128, 128, 128, 128, 128,
+                128, 245, 223, 189, 82, 18, 83, 128, 128, 128, 128, 128, 128, 128, 128, 128,
             ]),
             odds([
-                128, 159, 239, 198, 134, 60, 24, 89, 128, 128, 128, 128, 128, 128, 128, 128,
+                128, 177, 233, 204, 134, 56, 32, 102, 128, 128, 128, 128, 128, 128, 128, 128,
             ]),
             odds([
-                128, 152, 214, 199, 179, 98, 44, 121, 88, 128, 128, 128, 128, 128, 128, 128,
+                128, 162, 215, 186, 178, 97, 64, 134, 81, 128, 128, 128, 128, 128, 128, 128,
             ]),
             odds([
-                128, 143, 236, 229, 178, 131, 89, 52, 112, 94, 128, 128, 128, 128, 128, 128,
+                128, 171, 238, 219, 167, 140, 84, 68, 117, 90, 128, 128, 128, 128, 128, 128,
             ]),
             odds([
-                128, 139, 239, 234, 192, 179, 119, 77, 22, 109, 111, 128, 128, 128, 128, 128,
+                128, 162, 241, 234, 186, 176, 115, 70, 27, 118, 109, 128, 128, 128, 128, 128,
             ]),
             odds([
-                128, 159, 141, 244, 239, 187, 134, 89, 57, 15, 128, 124, 128, 128, 128, 128,
+                128, 211, 166, 246, 240, 190, 133, 76, 51, 19, 141, 128, 128, 128, 128, 128,
             ]),
             odds([
-                128, 150, 139, 243, 244, 199, 177, 111, 60, 11, 108, 99, 122, 128, 128, 128,
+                128, 192, 123, 247, 246, 212, 184, 106, 44, 13, 95, 113, 156, 128, 128, 128,
             ]),
             odds([
-                128, 146, 134, 246, 159, 238, 181, 127, 88, 51, 20, 118, 118, 128, 128, 128,
+                128, 173, 155, 249, 177, 242, 193, 132, 70, 40, 20, 110, 136, 158, 128, 128,
             ]),
             odds([
-                128, 149, 130, 240, 138, 235, 196, 169, 102, 34, 73, 16, 126, 107, 129, 128,
+                128, 192, 153, 241, 164, 237, 213, 180, 95, 27, 69, 20, 124, 165, 160, 128,
             ]),
         ],
+        many: odds([
+            128, 151, 177, 154, 233, 152, 216, 199, 149, 51, 42, 115, 45, 100, 112, 141,
+        ]),
         level: [
             odds([153, 130, 126]),
             odds([117, 149, 135]),
             odds([86, 97, 148]),
             odds([100, 86, 86]),
         ],
+        same: odds([208, 149]),
+        again: Odds::new(186),
+        turn_some: odds([208, 254, 171]),
+        turn_down: odds([128, 129]),
         turn_more: [
-            odds([121, 140, 171, 150, 157, 148]),
-            odds([103, 129, 232, 250, 247, 196]),
+            odds([235, 243, 245, 247, 244, 178]),
+            odds([242, 249, 250, 251, 250, 187]),
         ],
         across: [
             odds([
-                224, 203, 174, 130, 93, 30, 107, 119, 127, 127, 128, 128, 128, 128, 128, 128, 128,
+                179, 163, 166, 145, 80, 23, 39, 93, 108, 128, 128, 128, 128, 128, 128, 128, 128,
                 128, 128, 128, 128, 128, 128, 128, 128, 128, 128,
             ]),
             odds([
-                3, 226, 246, 231, 191, 27, 28, 93, 122, 126, 128, 128, 128, 128, 128, 128, 128,
+                26, 242, 233, 223, 144, 53, 15, 28, 81, 128, 128, 128, 128, 128, 128, 128, 128,
                 128, 128, 128, 128, 128, 128, 128, 128, 128, 128,
             ]),
             odds([
-                224, 200, 162, 119, 76, 33, 102, 126, 127, 128, 128, 128, 128, 128, 128, 128, 128,
+                180, 150, 152, 143, 72, 18, 52, 95, 120, 128, 128, 128, 128, 128, 128, 128, 128,
                 128, 128, 128, 128, 128, 128, 128, 128, 128, 128,
             ]),
             odds([
-                66, 118, 160, 177, 127, 67, 121, 126, 127, 128, 128, 128, 128, 128, 128, 128, 128,
+                119, 160, 139, 146, 91, 49, 58, 100, 128, 128, 128, 128, 128, 128, 128, 128, 128,
                 128, 128, 128, 128, 128, 128, 128, 128, 128, 128,
             ]),
             odds([
-                227, 210, 163, 111, 61, 54, 96, 123, 128, 128, 128, 128, 128, 128, 128, 128, 128,
+                194, 181, 154, 128, 64, 24, 30, 111, 128, 128, 128, 128, 128, 128, 128, 128, 128,
                 128, 128, 128, 128, 128, 128, 128, 128, 128, 128,
             ]),
             odds([
-                71, 163, 132, 137, 106, 96, 122, 127, 128, 128, 128, 128, 128, 128, 128, 128, 128,
+                104, 183, 143, 132, 74, 41, 59, 120, 128, 128, 128, 128, 128, 128, 128, 128, 128,
                 128, 128, 128, 128, 128, 128, 128, 128, 128, 128,
             ]),
             odds([
-                233, 221, 183, 129, 60, 33, 80, 123, 127, 128, 128, 128, 128, 128, 128, 128, 128,
+                194, 185, 168, 132, 62, 21, 41, 83, 99, 128, 128, 128, 128, 128, 128, 128, 128,
                 128, 128, 128, 128, 128, 128, 128, 128, 128, 128,
             ]),
             odds([
-                54, 187, 199, 169, 122, 56, 95, 124, 127, 127, 128, 128, 128, 128, 128, 128, 128,
+                32, 221, 202, 158, 82, 49, 24, 124, 145, 111, 128, 128, 128, 128, 128, 128, 128,
                 128, 128, 128, 128, 128, 128, 128, 128, 128, 128,
             ]),
         ],
-        again: Odds::new(191),
-        up: Odds::new(125),
+        up: Odds::new(120),
     };
 }
 
@@ -711,7 +773,7 @@ fn code_point<S: Side>(
     wanted: PatchPoint,
 ) -> Result<PatchPoint, StreamError> {
     let level_odds = odds.level.get_mut(usize::from(history.level));
-    let level = code_level(side, level_odds, wanted.level);
+    let level = code_level(side, level_odds, frame.highest, wanted.level);
     history.level = level;
     let normal = code_normal(side, odds, history, split_normal(wanted.normal))?;
     let normal = normal_code(normal);
@@ -733,9 +795,9 @@ fn code_point<S: Side>(
     })
 }
 
-fn code_level<S: Side>(side: &mut S, odds: Option<&mut [Odds; 3]>, wanted: u8) -> u8 {
+fn code_level<S: Side>(side: &mut S, odds: Option<&mut [Odds; 3]>, highest: u8, wanted: u8) -> u8 {
     let mut level = 0;
-    for odds in odds.into_iter().flatten() {
+    for odds in odds.into_iter().flatten().take(usize::from(highest)) {
         if !side.bit(odds, wanted > level) {
             break;
         }
@@ -819,37 +881,30 @@ fn code_position<S: Side>(
 ) -> Result<[u32; 3], StreamError> {
     let wanted = frame.offset(wanted);
     let (mut offset, left) = (part.offset, frame.left(part.depth));
+    let across = across(normal);
+    let along = match across {
+        0 => [1, 2],
+        1 => [0, 2],
+        _ => [0, 1],
+    };
+    let counts = along.map(|axis| u32::from(get(&left, axis)).saturating_sub(frame.shift));
+    let [first, second] = along.map(|axis| get(&wanted, axis) >> frame.shift);
+    let told = plain_pair(side, counts, [first, second]);
+    for (axis, told) in along.into_iter().zip(told) {
+        let middle = settled(0, frame.shift) & low_bits(u32::from(get(&left, axis)));
+        if let Some(offset) = offset.get_mut(usize::from(axis)) {
+            *offset |= told << frame.shift | middle;
+        }
+    }
     let steps = NORMAL_STEPS
         .get(usize::from(normal))
         .copied()
         .unwrap_or_default();
-    let [x, y, z] = steps.map(i32::unsigned_abs);
-    let across = if x >= y && x >= z {
-        0
-    } else if y >= z {
-        1
-    } else {
-        2
-    };
-    for (axis, offset) in offset.iter_mut().enumerate() {
-        if axis != across {
-            let left = left.get(axis).copied().unwrap_or(0);
-            *offset |= plain(
-                side,
-                u32::from(left),
-                wanted.get(axis).copied().unwrap_or(0),
-            );
-        }
-    }
     let (Some(low), Some(left)) = (offset.get(across).copied(), left.get(across)) else {
         return Err(StreamError::Value);
     };
     if *left > 0 {
-        let high = low
-            | 1u32
-                .checked_shl(u32::from(*left))
-                .unwrap_or(0)
-                .wrapping_sub(1);
+        let high = low | low_bits(u32::from(*left));
         let predicted = predict(frame, back, &steps, normal, across, offset).clamp(low, high);
         let wanted = wanted.get(across).copied().unwrap_or(0);
         let flat = steps.iter().filter(|step| **step != 0).count() == 1;
@@ -1070,6 +1125,6 @@ mod tests {
                 hash = (hash ^ u64::from(*byte)).wrapping_mul(0x100_0000_01b3);
             }
         }
-        assert_eq!(hash, 7360299150515250600);
+        assert_eq!(hash, 2438460953279813275);
     }
 }

@@ -11,11 +11,10 @@ use psao_core::mirror::Capacity;
 use psao_core::residual::{BLOCK, MAX_SLICE_BYTES, Quantiser, SliceState, encode_slice};
 use psao_core::slices::{self, FIRST, ITEM_HEADER_BYTES, Item, Operation};
 use psao_core::stream::{CHANGES_HEADER_BYTES, Writer, kind};
-use psao_core::topology::LEVELS;
 use psao_core::{Instance, Mirror};
 use rayon::prelude::*;
 use std::collections::{BTreeMap, HashSet};
-use std::ops::Range;
+use std::ops::{Range, RangeInclusive};
 use std::time::Instant;
 
 /// What a client gets at most.
@@ -428,7 +427,8 @@ impl Residual {
             let has = self.mirror.instances()[instance as usize];
             let placed = has.bucket_count > 0;
             let from = if placed { has.level } else { base };
-            let level = self.level_at(world, view, base, from, far);
+            let range = base..=world.coarsest(instance);
+            let level = self.level_at(world, view, range, from, far);
             if placed && level == has.level {
                 continue;
             }
@@ -453,7 +453,15 @@ impl Residual {
 
     /// The level for a distance in metres: the coarsest with enough points a pixel. A little
     /// farther is needed to lose points than to gain them.
-    fn level_at(&self, world: &World, view: &View<'_>, base: u32, from: u32, far: f32) -> u32 {
+    fn level_at(
+        &self,
+        world: &World,
+        view: &View<'_>,
+        range: RangeInclusive<u32>,
+        from: u32,
+        far: f32,
+    ) -> u32 {
+        let (base, coarsest) = range.into_inner();
         let Some(eye) = view.eye else { return base };
         let pixels = (eye.pixels_per_radian / far.max(1e-3)).powi(2);
         let wanted = self.limits.points_per_pixel * pixels;
@@ -465,7 +473,7 @@ impl Residual {
         while level > base && halvings < (level - base) as f32 {
             level -= 1;
         }
-        while level + 1 < LEVELS && halvings >= (level - base) as f32 + 1.25 {
+        while level < coarsest && halvings >= (level - base) as f32 + 1.25 {
             level += 1;
         }
         level

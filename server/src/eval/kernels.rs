@@ -198,6 +198,7 @@ pub fn run(args: &EvalArgs, progress: Progress<'_>) -> Result<Found, String> {
         for &placement in &args.placements {
             let options = Options {
                 rest_space: true,
+                levels: true,
                 // Cells so small that none overflows: what does is each variant's own affair.
                 cell_over_radius: 0.5,
                 adaptive: placement == PlacementArg::Adaptive,

@@ -2,8 +2,9 @@
 //! that they fall into.
 
 use super::{MAX_POINTS, Options, Progress, WorldError, bounds_of, count, deform, scale_of};
+use crate::lattice::Lattice;
 use crate::points::pilot::{Density, PILOT_RAYS, Pilot, densities};
-use crate::points::{PointError, SurfacePoint, generate, generate_adaptive, morton_order};
+use crate::points::{PointError, SurfacePoint, generate_with, morton_order};
 use crate::rays::{Against, CpuTracer, Deformed, Tracer, offset_origin, reach};
 use crate::samples::Samples;
 use crate::scene::{Mesh, Pose, Scene};
@@ -32,6 +33,8 @@ pub(super) struct Sampled {
     pub(super) users: Vec<(u32, Vec3)>,
     /// The largest of these.
     pub(super) scale: Vec3,
+    /// In rest space, the grid of level 0, around the mesh.
+    pub(super) grid: Option<Instance>,
     /// In progressive order, as many as the largest needs.
     pub(super) points: Vec<SurfacePoint>,
 }
@@ -225,12 +228,20 @@ pub(super) fn place_points(
             let mesh = &scene.meshes[set.mesh as usize];
             let largest = set.largest();
             let seed = options.seed.wrapping_add(u64::from(set.mesh));
-            let points = match &factors {
-                Some(factors) => {
-                    generate_adaptive(mesh, largest, options.density, &factors[number], seed)?
-                }
-                None => generate(mesh, largest, options.density, seed)?,
-            };
+            let corners = mesh.triangles.iter().flatten();
+            let bounds = bounds_of(corners.map(|i| mesh.positions[*i as usize]));
+            let (cell_m, radius) = (options.cell_m(), 1.0 / options.cell_over_radius);
+            let grid = fit(bounds, largest, cell_m, radius).filter(|_| options.rest_space);
+            let lattice = grid.as_ref().map(|grid| Lattice::new(mesh, grid));
+            let factors = factors.as_ref().map(|factors| &factors[number]);
+            let points = generate_with(
+                mesh,
+                largest,
+                options.density,
+                factors,
+                lattice.as_ref(),
+                seed,
+            )?;
             progress(
                 "points",
                 done.fetch_add(1, std::sync::atomic::Ordering::Relaxed) + 1,
@@ -240,6 +251,7 @@ pub(super) fn place_points(
                 mesh: set.mesh,
                 users: set.users,
                 scale: largest,
+                grid,
                 points: points.points,
             })
         })
