@@ -51,7 +51,7 @@ const FADE_S: f32 = 0.4;
 
 /// A slice waits while what it is off by, squared and summed over its points, is less than this many
 /// squares of the least difference that counts: what comes of it later costs hardly more bits.
-const LITTLE: u64 = 100;
+const LITTLE: u64 = 60;
 
 /// No slice waits longer for being little off.
 const WAIT_S: f32 = 0.1;
