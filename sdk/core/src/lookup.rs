@@ -401,6 +401,7 @@ impl<const LANES: usize> Blended<LANES> {
                 break;
             }
             let mut points = [Point::EMPTY; LANES];
+            #[allow(clippy::manual_memcpy, reason = "that would be a call, for one load")]
             for lane in 0..LANES.min(CELL_POINTS - first) {
                 points[lane] = cell.points[first + lane];
             }
