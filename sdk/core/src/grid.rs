@@ -102,10 +102,10 @@ impl Instance {
             .wrapping_add(hash % self.bucket_count.max(1))
     }
 
-    /// The buckets of a cell and of the next along x, whose hash is one more: one division for
-    /// both. x may be −1, as the largest number.
+    /// The buckets, in the bucket buffer, of a cell and of the next along x, whose hash is one
+    /// more: one division for both. x may be −1, as the largest number.
     #[inline(always)]
-    pub(crate) fn bucket_pair(&self, cell: [u32; 3]) -> [u32; 2] {
+    pub fn bucket_pair(&self, cell: [u32; 3]) -> [u32; 2] {
         let hash = self.weigh(cell, 17, 31);
         let count = self.bucket_count.max(1);
         let lower = hash % count;
