@@ -102,6 +102,21 @@ impl Instance {
             .wrapping_add(hash % self.bucket_count.max(1))
     }
 
+    /// The buckets, in the bucket buffer, of a cell and of the next along x, whose hash is one
+    /// more: one division for both. x may be −1, as the largest number.
+    #[inline(always)]
+    pub fn bucket_pair(&self, cell: [u32; 3]) -> [u32; 2] {
+        let hash = self.weigh(cell, 17, 31);
+        let count = self.bucket_count.max(1);
+        let lower = hash % count;
+        let wraps = hash == u32::MAX || lower + 1 == count;
+        let upper = if wraps { 0 } else { lower + 1 };
+        [
+            self.bucket_first.wrapping_add(lower),
+            self.bucket_first.wrapping_add(upper),
+        ]
+    }
+
     fn weigh(&self, [x, y, z]: [u32; 3], weight_y: u32, weight_z: u32) -> u32 {
         let row = self.dims[0];
         let layer = row.wrapping_mul(self.dims[1]);
@@ -137,6 +152,23 @@ mod tests {
                 let cell = [px, py, pz].map(|v| v as u32);
                 assert_eq!(u128::from(grid.bucket(cell)), wrapped);
                 assert_eq!(u128::from(grid.key(cell)), px + py * dx + pz * dx * dy);
+            }
+        }
+    }
+
+    #[test]
+    fn a_pair_of_buckets_is_what_each_cell_has_alone() {
+        for (dims, count) in [([7, 5, 3], 11), ([1 << 20; 3], 90_001), ([1, 1, 1], 1)] {
+            let grid = Instance {
+                bucket_first: 5,
+                ..instance(dims, count)
+            };
+            // With y 0, x alone takes the hash round.
+            for y in [0, 4, dims[1] / 2] {
+                for x in [u32::MAX - 1, u32::MAX, 0, 1, 9, 10, 11, dims[0] - 1] {
+                    let alone = [x, x.wrapping_add(1)].map(|x| grid.bucket([x, y, 0]));
+                    assert_eq!(grid.bucket_pair([x, y, 0]), alone, "{dims:?} {x} {y}");
+                }
             }
         }
     }

@@ -3,9 +3,9 @@
 //! A fragment at local position x with normal n blends the points of the 2×2×2 nearest cells of
 //! its instance's grid (paper, section 3.5). All lengths are in cells.
 
-use crate::cell::{Bucket, Cell};
+use crate::cell::{Bucket, CELL_POINTS, Cell};
 use crate::grid::Instance;
-use crate::point::{NORMALS, decode_position};
+use crate::point::{NORMAL_AXES, POSITION_STEPS, Point, decode_position};
 
 /// Eq. 3: points whose normal differs more than this (as a dot product) do not count; for
 /// [`Kernel::Planar`] they count as if it were this much, so next to nothing beside others.
@@ -115,6 +115,22 @@ impl Answer {
 
 type Vec3 = [f32; 3];
 
+/// A step of a point's position, in cells.
+const STEP: f32 = 1.0 / POSITION_STEPS as f32;
+
+/// The larger, `b` where `a` is NaN: an instruction, where `f32::max` is several.
+#[inline(always)]
+fn larger(a: f32, b: f32) -> f32 {
+    if a > b { a } else { b }
+}
+
+/// The smaller, `b` where `a` is NaN.
+#[inline(always)]
+fn smaller(a: f32, b: f32) -> f32 {
+    if a < b { a } else { b }
+}
+
+#[inline(always)]
 fn dot(a: Vec3, b: Vec3) -> f32 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
@@ -128,12 +144,19 @@ impl Lookup<'_> {
     pub fn blend(&self, kernel: Kernel, instance: u32, position: Vec3, normal: Vec3) -> Answer {
         // Chosen once, so that no point asks again.
         match kernel {
-            Kernel::Paper => self.blend_by::<Paper>(instance, position, normal),
-            Kernel::Planar => self.blend_by::<Planar>(instance, position, normal),
+            // Roots come one at a time: with more lanes it would only weigh empty ones.
+            Kernel::Paper => self.blend_by::<Paper, 1>(instance, position, normal),
+            Kernel::Planar => self.blend_by::<Planar, 4>(instance, position, normal),
         }
     }
 
-    fn blend_by<W: Weigh>(&self, instance: u32, position: Vec3, normal: Vec3) -> Answer {
+    /// `LANES` points of a cell are weighed at once.
+    fn blend_by<W: Weigh, const LANES: usize>(
+        &self,
+        instance: u32,
+        position: Vec3,
+        normal: Vec3,
+    ) -> Answer {
         let Some(grid) = self.instances.get(instance as usize) else {
             return Answer::OPEN;
         };
@@ -158,30 +181,55 @@ impl Lookup<'_> {
             place[axis] = g[axis] - base[axis] as f32;
         }
         let kernel = W::new(grid.radius, normal);
-        let sides = place.map(sides);
-        let mut blended = Blended::default();
-        for corner in 0..8i32 {
-            let offset = [corner & 1, corner >> 1 & 1, corner >> 2];
-            // −1 becomes a large number: below the grid is out of range too.
-            let cell: [u32; 3] = core::array::from_fn(|axis| (base[axis] + offset[axis]) as u32);
-            if (0..3).any(|axis| cell[axis] >= grid.dims[axis]) {
+        let sides = [sides(place[0]), sides(place[1]), sides(place[2])];
+        // Where steps are counted from: the middle of a cell's first.
+        let middle = decode_position(0);
+        let seen_from = [place[0] - middle, place[1] - middle, place[2] - middle];
+        let mut blended = Blended::<LANES>::default();
+        // −1 becomes a large number: below the grid is out of range too.
+        let [x, y, z] = [base[0] as u32, base[1] as u32, base[2] as u32];
+        for row in 0..4 {
+            let (up_y, up_z) = (row & 1, row >> 1);
+            let lower = [x, y.wrapping_add(up_y), z.wrapping_add(up_z)];
+            if lower[1] >= grid.dims[1] || lower[2] >= grid.dims[2] {
                 continue;
             }
-            let Some(found) = self.find(grid, cell) else {
-                continue;
-            };
-            let from = core::array::from_fn(|axis| offset[axis] as f32 - place[axis]);
-            let of_cell = Blended::of_cell(&kernel, found, from);
-            let side = (0..3).fold(1.0, |side, axis| side * sides[axis][offset[axis] as usize]);
-            blended.add(of_cell, if W::FADES { side } else { 1.0 });
+            let key = grid.key(lower);
+            let [bucket, next] = grid.bucket_pair(lower);
+            for up_x in 0..2 {
+                if x.wrapping_add(up_x) >= grid.dims[0] {
+                    continue;
+                }
+                // Not an array: that would be looked up in memory.
+                let bucket = if up_x == 0 { bucket } else { next };
+                let Some(cell) = self.named(bucket, key.wrapping_add(up_x)) else {
+                    continue;
+                };
+                let from = [
+                    up_x as f32 - seen_from[0],
+                    up_y as f32 - seen_from[1],
+                    up_z as f32 - seen_from[2],
+                ];
+                let [side_x, side_y, side_z] = sides;
+                let side = match W::FADES {
+                    true => side_x[up_x as usize] * side_y[up_y as usize] * side_z[up_z as usize],
+                    false => 1.0,
+                };
+                blended.add(&kernel, cell, from, side);
+            }
         }
         blended.answer::<W>()
     }
 
     /// The cell at a grid coordinate: hash, then search its bucket for the key.
     pub fn find(&self, grid: &Instance, cell: [u32; 3]) -> Option<&Cell> {
-        let key = grid.key(cell);
-        let bucket = self.buckets.get(grid.bucket(cell) as usize)?;
+        self.named(grid.bucket(cell), grid.key(cell))
+    }
+
+    /// The cell of this key that a bucket names.
+    #[inline(always)]
+    fn named(&self, bucket: u32, key: u32) -> Option<&Cell> {
+        let bucket = self.buckets.get(bucket as usize)?;
         // A loop, not iterators: those are not inlined, and this is a quarter of a lookup.
         for &entry in &bucket.entries {
             if entry == 0 {
@@ -241,23 +289,33 @@ trait Weigh {
 struct Paper {
     normal: Vec3,
     radius: f32,
+    inverse_radius: f32,
 }
 
 impl Weigh for Paper {
     const FADES: bool = false;
 
     fn new(radius: f32, normal: Vec3) -> Paper {
-        Paper { normal, radius }
+        Paper {
+            normal,
+            radius,
+            // Finite, for the same reason as that of `Planar`.
+            inverse_radius: (1.0 / radius).min(f32::MAX),
+        }
     }
 
+    #[inline(always)]
     fn weight(&self, d: Vec3, point_normal: Vec3, _: f32) -> f32 {
         let squared = dot(d, d);
         let along = dot(point_normal, d);
-        if dot(point_normal, self.normal) <= T_N || along * along >= T_D * squared && squared > 0.0
-        {
-            return 0.0;
-        }
-        ((self.radius - libm::sqrtf(squared)) / self.radius).max(0.0)
+        // Not lazily: a jump that is guessed wrong takes longer than both.
+        let away = dot(point_normal, self.normal) <= T_N;
+        let off_plane = (along * along >= T_D * squared) & (squared > 0.0);
+        let near = larger(
+            (self.radius - libm::sqrtf(squared)) * self.inverse_radius,
+            0.0,
+        );
+        if away | off_plane { 0.0 } else { near }
     }
 
     fn seen(_: f32) -> f32 {
@@ -281,68 +339,119 @@ impl Weigh for Planar {
         }
     }
 
+    #[inline(always)]
     fn weight(&self, d: Vec3, point_normal: Vec3, occlusion: f32) -> f32 {
-        let agree = dot(point_normal, self.normal).max(T_N);
-        let h = dot(self.normal, d).abs().max(dot(point_normal, d).abs());
+        let agree = larger(dot(point_normal, self.normal), T_N);
+        let (to_plane, to_own) = (dot(self.normal, d), dot(point_normal, d));
+        let h_squared = larger(to_plane * to_plane, to_own * to_own);
         let squared = dot(d, d);
-        let far = CORE + (squared + FLATNESS * (h * h)) * self.inverse_radius_squared;
-        let in_reach = (1.0 - squared * self.inverse_radius_squared * (1.0 / REACH)).max(BEYOND);
+        let far = CORE + (squared + FLATNESS * h_squared) * self.inverse_radius_squared;
+        let within = 1.0 - squared * self.inverse_radius_squared * (1.0 / REACH);
+        let in_reach = larger(within, BEYOND);
         let agree2 = agree * agree;
         let agree4 = agree2 * agree2;
         Self::seen(occlusion) * in_reach * (agree4 * agree4) / (far * far)
     }
 
+    #[inline(always)]
     fn seen(occlusion: f32) -> f32 {
-        let lit = (occlusion * (1.0 / (255.0 * SEEN))).min(1.0);
+        let lit = smaller(occlusion * (1.0 / (255.0 * SEEN)), 1.0);
         lit * lit + UNSEEN
     }
 }
 
-/// What points come to: sums over them.
-#[derive(Clone, Copy, Default)]
-struct Blended {
-    weight: f32,
-    /// Of weight times occlusion, 0 to 255.
-    sum: f32,
-    fetched: u32,
+/// Empties what is behind an empty place. Writers leave nothing there, so this is hardly ever
+/// called, and its jumps are in nobody's way.
+#[cold]
+fn empty_behind(points: &mut [Point]) {
+    for at in 1..points.len() {
+        if points[at - 1] == Point::EMPTY {
+            points[at] = Point::EMPTY;
+        }
+    }
 }
 
-impl Blended {
-    /// A cell's points; `from` is the vector from the fragment to the cell's lower corner.
-    fn of_cell<W: Weigh>(kernel: &W, cell: &Cell, from: Vec3) -> Blended {
-        let mut blended = Blended::default();
-        for point in cell.points() {
-            let step = point.position();
-            let d: Vec3 = core::array::from_fn(|axis| from[axis] + decode_position(step[axis]));
-            let occlusion = f32::from(point.occlusion());
-            let weight = kernel.weight(d, NORMALS[point.normal() as usize], occlusion);
-            blended.weight += weight;
-            blended.sum += weight * occlusion;
-            blended.fetched += 1;
-        }
-        blended
-    }
+/// What points come to: sums over them, a lane for each of those that are weighed at once. In a
+/// fixed order, so that all processors answer the same.
+struct Blended<const LANES: usize> {
+    weight: [f32; LANES],
+    /// Of weight times occlusion, 0 to 255.
+    sum: [f32; LANES],
+    fetched: [u32; LANES],
+}
 
-    /// Adds what a cell comes to, of which `side` counts.
-    fn add(&mut self, cell: Blended, side: f32) {
-        self.weight += side * cell.weight;
-        self.sum += side * cell.sum;
-        self.fetched += cell.fetched;
+impl<const LANES: usize> Default for Blended<LANES> {
+    fn default() -> Self {
+        Blended {
+            weight: [0.0; LANES],
+            sum: [0.0; LANES],
+            fetched: [0; LANES],
+        }
+    }
+}
+
+impl<const LANES: usize> Blended<LANES> {
+    /// Adds a cell's points, of which `side` counts; `from` is the vector from the fragment to the
+    /// middle of the cell's first step. Loops over lanes become vectors: they hold no jump and call
+    /// nothing.
+    #[inline(always)]
+    fn add<W: Weigh>(&mut self, kernel: &W, cell: &Cell, from: Vec3, side: f32) {
+        for first in (0..CELL_POINTS).step_by(LANES) {
+            if cell.points[first] == Point::EMPTY {
+                break;
+            }
+            let mut points = [Point::EMPTY; LANES];
+            #[allow(clippy::manual_memcpy, reason = "that would be a call, for one load")]
+            for lane in 0..LANES.min(CELL_POINTS - first) {
+                points[lane] = cell.points[first + lane];
+            }
+            let mut gap = false;
+            for lane in 1..LANES {
+                gap |= (points[lane - 1] == Point::EMPTY) & (points[lane] != Point::EMPTY);
+            }
+            if gap {
+                empty_behind(&mut points);
+            }
+            for lane in 0..LANES {
+                let point = points[lane];
+                let [x, y, z] = point.position();
+                let d = [
+                    from[0] + x as f32 * STEP,
+                    from[1] + y as f32 * STEP,
+                    from[2] + z as f32 * STEP,
+                ];
+                let code = point.normal() as usize;
+                let normal = [
+                    NORMAL_AXES[0][code],
+                    NORMAL_AXES[1][code],
+                    NORMAL_AXES[2][code],
+                ];
+                let occlusion = f32::from(point.occlusion());
+                let weight = side * kernel.weight(d, normal, occlusion);
+                let weight = if point.is_allocated() { weight } else { 0.0 };
+                self.weight[lane] += weight;
+                self.sum[lane] += weight * occlusion;
+                self.fetched[lane] += u32::from(point.is_allocated());
+            }
+            if points[LANES - 1] == Point::EMPTY {
+                break;
+            }
+        }
     }
 
     /// Eq. 4.
     fn answer<W: Weigh>(&self) -> Answer {
         let mut answer = Answer {
-            weight: self.weight,
-            fetched: self.fetched,
+            weight: self.weight.iter().sum(),
+            fetched: self.fetched.iter().sum(),
             ..Answer::OPEN
         };
-        if self.weight > 0.0 {
-            let occlusion = self.sum / self.weight;
+        if answer.weight > 0.0 {
+            let occlusion = self.sum.iter().sum::<f32>() / answer.weight;
             // The quotient of two sums may round past the largest value blended.
             answer.openness = (occlusion * (1.0 / 255.0)).min(1.0);
             // Dark points weigh less, but are as near.
-            answer.near = (self.weight / (NEAR * W::seen(occlusion))).min(1.0);
+            answer.near = (answer.weight / (NEAR * W::seen(occlusion))).min(1.0);
         }
         answer
     }
@@ -398,6 +507,34 @@ mod tests {
                 (other_side.openness - expected).abs() < 1e-6 && (other_side.weight > 0.0) == alone,
                 "{kernel:?} of a point that faces away: {other_side:?}"
             );
+        }
+    }
+
+    #[test]
+    fn places_that_were_left_are_skipped_and_nothing_behind_an_empty_one_counts() {
+        let (a, b) = (up(51), up(204));
+        let (left, empty) = (Point::LEFT, Point::EMPTY);
+        let gap_in_four = [a, empty, b, b, b, b, b];
+        let gap_after_four = [a, a, a, a, a, empty, b];
+        let all_left = [left, left, left, left, left, b, left];
+        for (points, fetched, openness) in [
+            (&[a, left, a][..], 2, 0.2),
+            (&gap_in_four, 1, 0.2),
+            (&gap_after_four, 5, 0.2),
+            (&all_left, 1, 0.8),
+            (&[empty, b], 0, 1.0),
+        ] {
+            let (grid, buckets, cells) = scene([1, 1, 1], points);
+            let lookup = Lookup {
+                instances: &[grid],
+                buckets: &buckets,
+                cells: &cells,
+            };
+            for kernel in [Kernel::Paper, Kernel::Planar] {
+                let answer = lookup.blend(kernel, 0, [1.4, 1.01, 1.6], [0.0, 1.0, 0.0]);
+                assert_eq!(answer.fetched, fetched, "{kernel:?} {points:?}");
+                assert!((answer.openness - openness).abs() < 1e-6, "{answer:?}");
+            }
         }
     }
 

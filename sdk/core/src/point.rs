@@ -120,6 +120,21 @@ pub static NORMALS: [[f32; 3]; 256] = {
     table
 };
 
+/// [`NORMALS`], an axis at a time: several points' are put together without taking vectors apart.
+pub(crate) static NORMAL_AXES: [[f32; 256]; 3] = {
+    let mut table = [[0.0; 256]; 3];
+    let mut code = 0;
+    while code < 256 {
+        let mut axis = 0;
+        while axis < 3 {
+            table[axis][code] = NORMALS[code][axis];
+            axis += 1;
+        }
+        code += 1;
+    }
+    table
+};
+
 /// The unit normals of all codes in 1/127, each component rounded towards 0.
 pub(crate) static NORMAL_STEPS: [[i32; 3]; 256] = {
     let mut table = [[0; 3]; 256];

@@ -19,6 +19,7 @@ use crate::report::{Form, Panel, Plot, Report};
 use crate::samples::Samples;
 use crate::world::{Options, Progress, World, scale_of};
 use glam::Vec3;
+use psao_core::Kernel;
 use psao_core::cell::CELL_POINTS;
 use rayon::prelude::*;
 use serde::Serialize;
@@ -444,10 +445,30 @@ fn measure<K: Weigh + 'static, const N: usize>(
         let every: Vec<_> = fragments.iter().step_by(SEAM_SHARE).collect();
         let at_switches = every.par_iter().filter_map(|f| step::<K, N>(&grids, f));
         steps.extend(at_switches.collect::<Vec<f64>>());
-        timed.push(Box::new(move |fragments| {
-            let one = |f: &&Fragment| grids.blend::<K>(f.instance, f.position, f.normal).openness;
-            fragments.iter().map(one).sum()
-        }));
+        // Of what the core has, the core's own code is timed.
+        let kernel = match variant.name {
+            Name::Paper => Some(Kernel::Paper),
+            Name::Planar => Some(Kernel::Planar),
+            _ => None,
+        };
+        let shipped = kernel.and_then(|kernel| Some((kernel, grids.of_client()?)));
+        timed.push(match shipped {
+            Some((kernel, buffers)) => Box::new(move |fragments| {
+                let lookup = buffers.lookup();
+                let one = |f: &&Fragment| {
+                    let (position, normal) = (f.position.to_array(), f.normal.to_array());
+                    lookup.blend(kernel, f.instance, position, normal).openness
+                };
+                fragments.iter().map(one).sum()
+            }),
+            None => Box::new(move |fragments| {
+                let one = |f: &&Fragment| {
+                    let found = grids.blend::<K>(f.instance, f.position, f.normal);
+                    found.openness
+                };
+                fragments.iter().map(one).sum()
+            }),
+        });
         let (width, height) = (shot.view.width, shot.view.height);
         let valid = shot.view.valid();
         let Ok(pair) = Pair::new(&shot.reference, &test, &valid, width, height) else {

@@ -5,7 +5,7 @@ use crate::truth::{Placement, buckets_for, choose_buckets, fit};
 use glam::Vec3;
 use psao_core::lookup::{BEYOND, CORE, FADE, FLATNESS, REACH, SEEN, T_D, T_N, UNSEEN};
 use psao_core::point::{NORMALS, decode_position};
-use psao_core::{Bucket, Instance, Point};
+use psao_core::{Bucket, Instance, Lookup, Point};
 use rayon::prelude::*;
 use std::collections::HashMap;
 
@@ -51,6 +51,25 @@ pub struct Grids<const N: usize> {
     pub discarded: usize,
     /// Points in all.
     pub points: usize,
+}
+
+/// What the core's lookup reads.
+#[derive(Clone, Debug)]
+pub struct ClientBuffers {
+    instances: Vec<Instance>,
+    buckets: Vec<Bucket>,
+    cells: Vec<psao_core::Cell>,
+}
+
+impl ClientBuffers {
+    /// The core's lookup.
+    pub fn lookup(&self) -> Lookup<'_> {
+        Lookup {
+            instances: &self.instances,
+            buckets: &self.buckets,
+            cells: &self.cells,
+        }
+    }
 }
 
 impl<const N: usize> Grids<N> {
@@ -118,26 +137,36 @@ impl<const N: usize> Grids<N> {
         }
         let mut kernel = K::new(grid.radius, normal, place);
         let mut fetched = 0;
-        for corner in 0..8i32 {
-            let offset = [corner & 1, corner >> 1 & 1, corner >> 2];
-            let cell: [u32; 3] = std::array::from_fn(|axis| (base[axis] + offset[axis]) as u32);
-            if (0..3).any(|axis| cell[axis] >= grid.dims[axis]) {
+        // As the core goes about it, so that times compare.
+        let [x, y, z] = base.map(|lower| lower as u32);
+        for row in 0..4 {
+            let (up_y, up_z) = (row & 1, row >> 1);
+            let lower = [x, y.wrapping_add(up_y), z.wrapping_add(up_z)];
+            if lower[1] >= grid.dims[1] || lower[2] >= grid.dims[2] {
                 continue;
             }
-            let Some(found) = self.find(grid, cell) else {
-                continue;
-            };
-            kernel.enter(corner as usize);
-            let from = Vec3::from(offset.map(|o| o as f32)) - place;
-            for point in found.points.iter().take_while(|p| p.is_allocated()) {
-                let d = from + Vec3::from(point.position().map(decode_position));
-                let point_normal = Vec3::from(NORMALS[point.normal() as usize]);
-                kernel.add(
-                    d,
-                    point_normal,
-                    f32::from(point.occlusion()) * (1.0 / 255.0),
-                );
-                fetched += 1;
+            let key = grid.key(lower);
+            let [bucket, next] = grid.bucket_pair(lower);
+            for up_x in 0..2 {
+                if x.wrapping_add(up_x) >= grid.dims[0] {
+                    continue;
+                }
+                let bucket = if up_x == 0 { bucket } else { next };
+                let Some(found) = self.named(bucket, key.wrapping_add(up_x)) else {
+                    continue;
+                };
+                kernel.enter((up_x + 2 * row) as usize);
+                let from = Vec3::new(up_x as f32, up_y as f32, up_z as f32) - place;
+                for point in &found.points {
+                    if !point.is_allocated() {
+                        break;
+                    }
+                    let step = point.position().map(decode_position);
+                    let point_normal = Vec3::from(NORMALS[point.normal() as usize]);
+                    let openness = f32::from(point.occlusion()) * (1.0 / 255.0);
+                    kernel.add(from + Vec3::from(step), point_normal, openness);
+                    fetched += 1;
+                }
             }
         }
         Blended {
@@ -146,11 +175,33 @@ impl<const N: usize> Grids<N> {
         }
     }
 
-    fn find(&self, grid: &Instance, cell: [u32; 3]) -> Option<&Cell<N>> {
-        let key = grid.key(cell);
-        let bucket = &self.buckets[grid.bucket(cell) as usize];
-        let mut named = bucket.cells().map(|entry| &self.cells[entry as usize]);
-        named.find(|cell| cell.key == key)
+    #[inline(always)]
+    fn named(&self, bucket: u32, key: u32) -> Option<&Cell<N>> {
+        for &entry in &self.buckets[bucket as usize].entries {
+            if entry == 0 {
+                break;
+            }
+            let cell = &self.cells[entry as usize];
+            if cell.key == key {
+                return Some(cell);
+            }
+        }
+        None
+    }
+
+    /// The same buffers as clients have them, if their cells have as much room.
+    pub fn of_client(&self) -> Option<ClientBuffers> {
+        let cells = self.cells.iter().map(|cell| {
+            Some(psao_core::Cell {
+                key: cell.key,
+                points: cell.points.as_slice().try_into().ok()?,
+            })
+        });
+        Some(ClientBuffers {
+            instances: self.instances.clone(),
+            buckets: self.buckets.clone(),
+            cells: cells.collect::<Option<_>>()?,
+        })
     }
 
     /// Where a fragment is in its grid, in cells, and what a cell is in the grid's space.
@@ -496,7 +547,7 @@ impl Weigh for Facing {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use psao_core::{Kernel, Lookup};
+    use psao_core::Kernel;
 
     #[test]
     fn kernels_of_the_core_answer_here_as_they_do_there() {
@@ -523,17 +574,8 @@ mod tests {
         };
         let grids = Grids::<7>::new(1, &[set], 0.07, 1.25, 7);
         assert!(grids.discarded > 0 && grids.cells.len() > 100);
-        let cells: Vec<psao_core::Cell> = (grids.cells.iter())
-            .map(|cell| psao_core::Cell {
-                key: cell.key,
-                points: cell.points,
-            })
-            .collect();
-        let lookup = Lookup {
-            instances: &grids.instances,
-            buckets: &grids.buckets,
-            cells: &cells,
-        };
+        let buffers = grids.of_client().unwrap();
+        let lookup = buffers.lookup();
         for _ in 0..2000 {
             let at = Vec3::new(next(), next() * 0.1, next());
             let normal = Vec3::new(next() - 0.5, 1.0, next());
