@@ -105,7 +105,7 @@ fn points_say_the_same_bit_for_bit_when_their_rays_are_traced_together_on_a_devi
 #[test]
 fn a_gpu_asked_of_a_build_without_one_is_refused_with_the_remedy() {
     use clap::Parser;
-    use psao_server::args::DeviceArg;
+    use psao_server::args::{DeviceArg, Layout};
     use psao_server::demo::DemoArgs;
 
     #[derive(Parser)]
@@ -116,7 +116,7 @@ fn a_gpu_asked_of_a_build_without_one_is_refused_with_the_remedy() {
     let cli = Cli::parse_from(["demo", "--trace", "gpu"]);
     let DemoArgs { scene, trace, .. } = cli.demo;
     assert_eq!(trace.trace, DeviceArg::Gpu);
-    let refused = trace.world(&scene, true, &|_, _, _| ());
+    let refused = trace.world(&scene, Layout::Patches, &|_, _, _| ());
     let why = refused.map(|_| ()).expect_err("there is no GPU");
     assert!(why.contains("--features gpu"), "{why}");
 }
