@@ -318,7 +318,7 @@ mod tests {
             (squares / fine.triangles.len() as f64).sqrt()
         };
         let [free, bound] = [gap(None), gap(Some(&lattice))];
-        assert!(bound < 1.02 * free, "{bound} instead of {free}");
+        assert!(bound < 1.01 * free, "{bound} instead of {free}");
     }
 
     #[test]

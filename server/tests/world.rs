@@ -403,7 +403,10 @@ fn points_that_face_no_eye_wait_until_they_face_one() {
 #[test]
 fn points_of_levels_that_no_client_has_wait_until_one_has_them() {
     const COARSE: u32 = 2;
-    let options = laid_out(options(256.0, 64), residual());
+    let options = Options {
+        levels: true,
+        ..laid_out(options(256.0, 64), residual())
+    };
     let mut whole = world(small_scene(), options.clone());
     let mut thin = world(small_scene(), options);
     for world in [&mut whole, &mut thin] {

@@ -230,12 +230,13 @@ fn patches_outside_their_limits_are_refused() {
     refused(&[&one[..], &[0]].concat(), "15.9: end of the data");
     let points: Vec<PatchPoint> = (0..30).map(|at| point([at * 7 % 30, at, 3], 0)).collect();
     let data = patch_of(&points);
-    for length in 0..data.len() {
-        // What is cut off may be another patch, but hardly ever.
+    let read = (0..data.len()).filter(|&length| {
         let cut = patch_read(&data[..length]);
-        assert!(cut.is_err() || length + 2 > data.len(), "{length} bytes");
         assert_ne!(cut, patch_read(&data));
-    }
+        cut.is_ok()
+    });
+    // What is cut off may be another patch, but hardly ever.
+    assert!(read.count() < 4, "of {} bytes", data.len());
 }
 
 /// FNV-1a.
