@@ -29,7 +29,7 @@ use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
 use std::sync::Arc;
-use turns::{Block, Due, Turn};
+use turns::{Block, Cost, Due, Turn};
 
 /// Points of a slice: the unit of visibility and of tracing.
 pub const SLICE_POINTS: usize = 1024;
@@ -251,6 +251,8 @@ pub struct World {
     turns: Vec<Turn>,
     /// The blocks of all slices, [`SLICE_BLOCKS`] each.
     blocks: Vec<Block>,
+    /// Of each instance.
+    costs: Vec<Cost>,
     /// [`World::finest_levels`] of the last step, of every instance.
     stepped_levels: Vec<u32>,
     /// Calls of [`World::step`].
@@ -321,6 +323,7 @@ impl World {
             swept: vec![[Hull::default(); 2]; scene.instances.len()],
             turns: Vec::new(),
             blocks: Vec::new(),
+            costs: vec![Cost::default(); scene.instances.len()],
             eyes: Vec::new(),
             finest_levels: Vec::new(),
             stepped_levels: vec![0; scene.instances.len()],
@@ -911,32 +914,6 @@ impl World {
         stats
     }
 
-    /// The blocks of a slice from which a ray may meet what moves.
-    fn near_movers(&self, slice: &Slice) -> u64 {
-        let instance = slice.instance as usize;
-        let Some(cones) = self.cones_at(slice).filter(|_| !self.moves[instance]) else {
-            return u64::MAX;
-        };
-        let reach = self.options.ao_distance_m;
-        let movers = (0..self.moves.len()).filter(|&mover| self.moves[mover]);
-        let movers = movers.map(|mover| &self.swept[mover][0]);
-        let movers: Vec<&Hull> = movers
-            .filter(|mover| mover.is_near(slice.bounds, reach))
-            .collect();
-        let world = &self.pose.instances[instance].world_from_local;
-        let stretch = stretch(world);
-        let is_near = |cone: &Cone| {
-            let (center, radius) = cone.ball();
-            let center = world.transform_point3(center);
-            // A little more, for rounding.
-            let around = radius * stretch * 1.001 + center.abs().max_element() * 1e-5;
-            let bounds = [center - around, center + around];
-            movers.iter().any(|mover| mover.is_near(bounds, reach))
-        };
-        let near = cones.iter().rev().map(is_near);
-        near.fold(0, |blocks, near| blocks << 1 | u64::from(near))
-    }
-
     /// Traces blocks, slice by slice in order. How many rays and points.
     fn trace_due(&mut self, due: &[Due], report: &(dyn Fn(u64, u64) + Sync)) -> (u64, u64) {
         let words = self.words();
@@ -975,7 +952,7 @@ impl World {
                 points,
                 rays: due.rays,
                 blocks,
-                block_rays: [0; BATCH_POINTS / BLOCK],
+                taken: 0,
                 still: None,
                 fixed: own,
                 occlusion: own_occlusion,
@@ -1030,6 +1007,9 @@ impl World {
         let slice = &self.slices[batch.slice];
         let first = (batch.points.start - slice.points.start) as usize / BLOCK;
         let gained = batch.rays > slice.rays_done;
+        if !gained {
+            self.costs[slice.instance as usize].traced += batch.taken as f32;
+        }
         let mut changed = 0;
         for (number, occlusion) in batch.occlusion.chunks(BLOCK).enumerate() {
             if batch.blocks >> number & 1 == 0 {
@@ -1054,7 +1034,6 @@ impl World {
                 let rate = change / block.age(self.steps).max(1.0);
                 // One step without a change says little of the next.
                 block.rate = rate.max(block.rate * 0.5);
-                block.rays = batch.block_rays[number];
             }
             block.traced_at = self.steps;
         }
@@ -1193,7 +1172,6 @@ impl World {
             }
             let fan = self.fan(&surface, number, position, normal);
             points_traced += 1;
-            let before = rays_traced;
             hit.fill(0);
             if let Some(attached) = attached {
                 if converging && batch.still.is_none() {
@@ -1219,9 +1197,9 @@ impl World {
                 self.tracer
                     .occluded_fan(others, &fan, t_max, &todo, &mut hit);
             }
-            batch.block_rays[block] += (rays_traced - before) as u32;
             *occlusion = openness(&hit, rays);
         }
+        batch.taken = rays_traced;
         (rays_traced, points_traced)
     }
 
@@ -1677,8 +1655,8 @@ struct Batch<'a> {
     rays: usize,
     /// Which of its blocks.
     blocks: u8,
-    /// Rays that each took.
-    block_rays: [u32; BATCH_POINTS / BLOCK],
+    /// Rays that it took.
+    taken: u64,
     /// Rays against what stands still, if they have been traced already.
     still: Option<u64>,
     /// Their part of [`World::fixed`].
@@ -1770,6 +1748,15 @@ impl Hull {
         let nearest = position.clamp(self.bounds[0], self.bounds[1]);
         position.distance_squared(self.center) <= far * far
             && nearest.distance_squared(position) <= reach * reach * 1.0001
+    }
+
+    /// Which part of a point's rays, about, go to the ball: above 0.
+    fn share(&self, position: Vec3, normal: Vec3) -> f32 {
+        let to = self.center - position;
+        let sin = (self.radius / to.length().max(f32::MIN_POSITIVE)).min(1.0);
+        // Right where all of it is ahead, or it is half of all that can be seen.
+        let ahead = (normal.dot(to.normalize_or_zero()) + sin) / (1.0 + sin);
+        (sin * sin * ahead).max(1e-3)
     }
 
     /// Part of it is above the plane at a place.

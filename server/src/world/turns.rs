@@ -1,7 +1,7 @@
 //! Which points are traced now that something moved near them, where there are fewer rays than all
 //! of them need.
 
-use super::World;
+use super::{Hull, Slice, World, stretch};
 use crate::facing::Faces;
 use crate::topology::SLICE_BLOCKS;
 use psao_core::residual::BLOCK;
@@ -11,7 +11,12 @@ use rayon::prelude::*;
 const NEAREST_M: f32 = 0.5;
 
 /// What choosing and culling the points of a block costs, in rays.
-const BLOCK_RAYS: u32 = 128;
+const BLOCK_RAYS: f32 = 16.0;
+
+/// How much a step counts, less than the one after it, for what the next one is foretold to take;
+/// and rays that are taken to have been as foretold before the first.
+const FORGET: f32 = 0.75;
+const FORETOLD_RIGHT: f32 = 4096.0;
 
 /// How fast what points say is taken to change, in 1/255 a step: at the least, as what moves may
 /// come nearer; and as long as nobody has looked, or what moves has only now come within reach.
@@ -43,8 +48,6 @@ pub(super) struct Block {
     pub(super) traced_at: u64,
     /// How fast what they say changed before that, 1/255 a step, root mean square.
     pub(super) rate: f32,
-    /// The rays that it took.
-    pub(super) rays: u32,
 }
 
 impl Default for Block {
@@ -53,7 +56,6 @@ impl Default for Block {
         Block {
             traced_at: 0,
             rate: NEW_RATE,
-            rays: 64 * BLOCK as u32,
         }
     }
 }
@@ -64,9 +66,26 @@ impl Block {
     }
 }
 
+/// What was traced of an instance's blocks of late, to tell what they are going to take.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Cost {
+    /// Rays that [`World::shares_towards_movers`] foretold, and those that were traced.
+    foretold: f32,
+    pub(super) traced: f32,
+}
+
+impl Cost {
+    /// What a ray foretold comes to.
+    fn factor(&self) -> f32 {
+        (self.traced + FORETOLD_RIGHT) / (self.foretold + FORETOLD_RIGHT)
+    }
+}
+
 /// What a visible slice owes: see [`Turn`].
 struct Owing {
     near: u64,
+    /// Of the blocks that may show: which part of their points' rays may meet what moves.
+    shares: [f32; SLICE_BLOCKS],
     owed: u64,
     /// Blocks owed that may show.
     wanted: u64,
@@ -78,7 +97,9 @@ struct Owing {
 struct Candidate {
     /// What it is worth.
     gain: f32,
-    rays: u64,
+    /// What it is foretold to take, before and after what was learnt.
+    foretold: f32,
+    rays: f32,
     /// Into [`World::blocks`].
     block: usize,
 }
@@ -105,6 +126,10 @@ impl World {
             .collect();
         let mut due = Vec::new();
         let mut candidates = Vec::new();
+        for cost in &mut self.costs {
+            cost.foretold *= FORGET;
+            cost.traced *= FORGET;
+        }
         for (owing, &(index, rays)) in looked.iter().zip(asked) {
             let slice = &mut self.slices[index];
             slice.stale = false;
@@ -118,12 +143,6 @@ impl World {
                     rays,
                     blocks: Faces::all_of(slice).any,
                 });
-            } else if rays > 0 && refresh_rays == u64::MAX {
-                due.push(Due {
-                    slice: index,
-                    rays,
-                    blocks: owing.wanted,
-                });
             } else if rays > 0 {
                 let blocks = (0..SLICE_BLOCKS).filter(|block| owing.wanted >> block & 1 == 1);
                 for number in blocks {
@@ -132,15 +151,18 @@ impl World {
                     if unknown >> number & 1 == 1 {
                         block.rate = block.rate.max(NEW_RATE);
                     }
-                    let (age, rays) = (block.age(self.steps), block.rays + BLOCK_RAYS);
+                    let age = block.age(self.steps);
+                    let foretold = owing.shares[number] * (rays * BLOCK) as f32;
+                    let rays = foretold * self.costs[slice.instance as usize].factor();
                     // If the rate were known, the mean squared error would be least, for so many
                     // rays, where each block is traced when weight · rate² · age³ / rays has grown
                     // to the same value. It is a guess, so that what is dear waits less long than
                     // that; and many rays of one point cost little more time than few.
                     let lag = ((block.rate + LEAST_RATE) * age).min(MOST_LAG);
                     candidates.push(Candidate {
-                        gain: lag * lag * age * owing.weight / (rays as f32).sqrt(),
-                        rays: u64::from(rays),
+                        gain: lag * lag * age * owing.weight / (rays + BLOCK_RAYS).sqrt(),
+                        foretold,
+                        rays,
                         block: at,
                     });
                 }
@@ -150,10 +172,10 @@ impl World {
             let order = b.gain.total_cmp(&a.gain);
             order.then(a.block.cmp(&b.block))
         });
-        let mut left = refresh_rays;
+        let mut left = refresh_rays as f32;
         let fits = |candidate: &&Candidate| {
-            let fits = left > 0;
-            left = left.saturating_sub(candidate.rays);
+            let fits = left > 0.0;
+            left -= candidate.rays + BLOCK_RAYS;
             fits
         };
         let taken = candidates.iter().take_while(fits).count();
@@ -163,6 +185,8 @@ impl World {
         for turn in candidates.chunk_by(|a, b| a.block / SLICE_BLOCKS == b.block / SLICE_BLOCKS) {
             let index = turn[0].block / SLICE_BLOCKS;
             let bits = turn.iter().map(|own| 1u64 << (own.block % SLICE_BLOCKS));
+            let cost = &mut self.costs[self.slices[index].instance as usize];
+            cost.foretold += turn.iter().map(|own| own.foretold).sum::<f32>();
             due.push(Due {
                 slice: index,
                 rays: self.slices[index].rays_done,
@@ -177,15 +201,15 @@ impl World {
     /// What a visible slice owes in the present pose.
     fn owing(&self, index: usize) -> Owing {
         let (slice, turn) = (&self.slices[index], &self.turns[index]);
-        let (near, owed) = if slice.stale {
-            (self.near_movers(slice), u64::MAX)
-        } else {
-            (turn.near, turn.owed)
-        };
+        let owed = if slice.stale { u64::MAX } else { turn.owed };
+        let shares = self.shares_towards_movers(slice);
+        let near = shares.iter().rev();
+        let near = near.fold(0, |blocks, share| blocks << 1 | u64::from(*share > 0.0));
         // What no mover reaches, and none did, says what it said.
         let owed = owed & (near | turn.had) & Faces::all_of(slice).any;
         let mut owing = Owing {
             near,
+            shares,
             owed,
             wanted: owed,
             weight: 1.0,
@@ -202,5 +226,38 @@ impl World {
             owing.wanted &= eyes.fold(0, |faces, eye| faces | self.facing(slice, *eye).any);
         }
         owing
+    }
+
+    /// Of each block of a slice, which part of its points' rays may meet what moves, about: 0 only
+    /// where no ray may.
+    fn shares_towards_movers(&self, slice: &Slice) -> [f32; SLICE_BLOCKS] {
+        let instance = slice.instance as usize;
+        let Some(cones) = self.cones_at(slice).filter(|_| !self.moves[instance]) else {
+            return [1.0; SLICE_BLOCKS];
+        };
+        let reach = self.options.ao_distance_m;
+        let movers = (0..self.moves.len()).filter(|&mover| self.moves[mover]);
+        let movers = movers.map(|mover| &self.swept[mover][0]);
+        let movers: Vec<&Hull> = movers
+            .filter(|mover| mover.is_near(slice.bounds, reach))
+            .collect();
+        let mut shares = [0.0; SLICE_BLOCKS];
+        if movers.is_empty() {
+            return shares;
+        }
+        let pose = &self.pose.instances[instance];
+        let stretch = stretch(&pose.world_from_local);
+        for (share, cone) in shares.iter_mut().zip(cones) {
+            let (center, radius) = cone.ball();
+            let center = pose.world_from_local.transform_point3(center);
+            // A little more, for rounding.
+            let around = radius * stretch * 1.001 + center.abs().max_element() * 1e-5;
+            let bounds = [center - around, center + around];
+            let near = movers.iter().filter(|mover| mover.is_near(bounds, reach));
+            let normal = pose.world_normal(cone.axis());
+            let towards = near.map(|mover| mover.share(center, normal));
+            *share = towards.sum::<f32>().min(1.0);
+        }
+        shares
     }
 }
