@@ -972,9 +972,9 @@ impl Evaluation {
         let plot = |(run, mut rows): (String, Vec<&Row>)| {
             rows.sort_by(|a, b| a.density.total_cmp(&b.density));
             let costs: [(&str, fn(&Row) -> f64); 5] = [
-                ("step", |row| row.step_ms),
+                ("server frame", |row| row.frame_ms),
                 ("select and encode", |row| row.select_ms + row.encode_ms),
-                ("decode", |row| row.decode_ms),
+                ("client frame", |row| row.decode_ms),
                 ("Mbit/s", |row| row.mbit_per_s),
                 ("Mbit/s, topology shipped", |row| {
                     row.mbit_per_s - row.mbit_per_s_topology

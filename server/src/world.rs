@@ -5,6 +5,7 @@
 //! against geometry that a point is rigidly attached to are traced once and kept as bits; the
 //! others again only when something moved within their reach.
 
+mod between;
 mod place;
 mod turns;
 
@@ -17,6 +18,7 @@ use crate::samples::Samples;
 use crate::scene::{InstancePose, Mesh, Pose, Scene};
 use crate::topology::{Adjacency, PointSet, SLICE_BLOCKS, Topology};
 use crate::truth::{Place, Placement, Truth, choose_buckets, fit};
+use between::{Between, THIN};
 use glam::{Affine3A, DAffine3, Vec3, Vec3A};
 use place::{
     Placed, Sampled, distinct_cells, extent, place_instances, place_points, shared_points,
@@ -47,7 +49,8 @@ pub struct Options {
     /// Rays a point, 1 to 4096.
     pub rays: usize,
     /// Rays that a step spends on points near what moves, about; `u64::MAX` for all that they
-    /// need. Where that is less, those have their turn first whose lag is likely to show most, and
+    /// need. Where that is less, those have their turn first whose lag is likely to show most; some
+    /// change as points around them do, before they are traced themselves; and
     /// all are up to date some steps after the last move. May be changed between steps.
     pub refresh_rays: u64,
     /// Kernel that the grid is laid out for.
@@ -922,17 +925,18 @@ impl World {
             std::mem::take(&mut self.fixed),
             std::mem::take(&mut self.traced),
         );
-        let parts = |due: &Due| -> Vec<(Range<u32>, u8)> {
+        let parts = |due: &Due| -> Vec<(Range<u32>, [u8; 2])> {
             let points = &self.slices[due.slice].points;
             let firsts = points.clone().step_by(BATCH_POINTS).enumerate();
             let parts = firsts.map(|(part, first)| {
                 let last = points.end.min(first + BATCH_POINTS as u32);
-                let blocks = due.blocks >> (part * BATCH_POINTS / BLOCK);
-                (first..last, blocks as u8)
+                let first_block = part * BATCH_POINTS / BLOCK;
+                let own = [due.blocks, due.thin].map(|blocks| (blocks >> first_block) as u8);
+                (first..last, own)
             });
-            parts.filter(|(_, blocks)| *blocks > 0).collect()
+            parts.filter(|(_, [blocks, _])| *blocks > 0).collect()
         };
-        let parts: Vec<(&Due, Range<u32>, u8)> = due
+        let parts: Vec<(&Due, Range<u32>, [u8; 2])> = due
             .iter()
             .flat_map(|due| parts(due).into_iter().map(move |(p, b)| (due, p, b)))
             .collect();
@@ -940,7 +944,7 @@ impl World {
         traced.resize(total, 0);
         let mut batches = Vec::with_capacity(parts.len());
         let (mut bits, mut bits_from, mut occlusion) = (&mut fixed[..], 0, &mut traced[..]);
-        for (due, points, blocks) in parts {
+        for (due, points, [blocks, thin]) in parts {
             let from = points.start as usize * words;
             let skipped = bits.split_at_mut(from - bits_from).1;
             let (own, rest) = skipped.split_at_mut(points.len() * words);
@@ -952,6 +956,7 @@ impl World {
                 points,
                 rays: due.rays,
                 blocks,
+                thin,
                 taken: 0,
                 still: None,
                 fixed: own,
@@ -982,10 +987,11 @@ impl World {
             let whole = due.rays > slice.rays_done
                 || Some(self.finest_level(slice.instance)) <= self.level_of(slice.instance);
             let turn = &mut self.turns[due.slice];
-            turn.owed &= !due.blocks;
-            turn.had = turn.had & !due.blocks | turn.near & due.blocks;
+            let exact = due.blocks & !due.thin;
+            turn.owed &= !exact;
+            turn.had = turn.had & !exact | turn.near & due.blocks;
             if whole {
-                turn.missed &= !due.blocks;
+                turn.missed &= !exact;
             } else {
                 turn.missed |= due.blocks;
             }
@@ -1034,6 +1040,7 @@ impl World {
                 let rate = change / block.age(self.steps).max(1.0);
                 // One step without a change says little of the next.
                 block.rate = rate.max(block.rate * 0.5);
+                block.note_turn(batch.thin >> number & 1 == 1, change);
             }
             block.traced_at = self.steps;
         }
@@ -1141,12 +1148,17 @@ impl World {
             .collect();
         let (mut todo, mut hit, mut known) = (vec![0; words], vec![0; words], vec![0; words]);
         let (mut rays_traced, mut points_traced) = (batch.still.unwrap_or(0), 0);
+        let first_block = (batch.points.start - slice.points.start) as usize / BLOCK;
+        let turns = &self.blocks[batch.slice * SLICE_BLOCKS + first_block..];
+        let mut between = [Between::default(); BATCH_POINTS / BLOCK];
+        let mut untraced: Vec<(usize, Vec3, Vec3)> = Vec::new();
         let parts = batch
             .fixed
             .chunks_exact_mut(words)
             .zip(&mut *batch.occlusion);
         for (number, (fixed, occlusion)) in batch.points.clone().zip(parts) {
-            let block = (number - batch.points.start) as usize / BLOCK;
+            let index = (number - batch.points.start) as usize;
+            let block = index / BLOCK;
             if batch.blocks >> block & 1 == 0 {
                 continue;
             }
@@ -1167,6 +1179,12 @@ impl World {
             let ahead = |mover: &&Hull| in_reach(mover) && mover.is_ahead(position, normal);
             let others_near = !only_movers || movers.iter().any(|m| ahead(&m));
             if !converging && !others_near {
+                *occlusion = openness(fixed, rays);
+                continue;
+            }
+            let thin = batch.thin >> block & 1 == 1;
+            if thin && index % THIN != usize::from(turns[block].number) % THIN {
+                untraced.push((index, position, normal));
                 *occlusion = openness(fixed, rays);
                 continue;
             }
@@ -1198,6 +1216,18 @@ impl World {
                     .occluded_fan(others, &fan, t_max, &todo, &mut hit);
             }
             *occlusion = openness(&hit, rays);
+            if thin {
+                let before = self.occlusion[number as usize];
+                let change = f32::from(*occlusion) - f32::from(before);
+                between[block].learn(position, normal, change);
+            }
+        }
+        let before = &self.occlusion[batch.points.start as usize..];
+        for (index, position, normal) in untraced {
+            let change = between[index / BLOCK].change_at(position, normal);
+            // Not more open than without what moves.
+            let most = &mut batch.occlusion[index];
+            *most = ((f32::from(before[index]) + change).round() as u8).min(*most);
         }
         batch.taken = rays_traced;
         (rays_traced, points_traced)
@@ -1655,6 +1685,8 @@ struct Batch<'a> {
     rays: usize,
     /// Which of its blocks.
     blocks: u8,
+    /// Those of them of which one point in [`THIN`] is traced.
+    thin: u8,
     /// Rays that it took.
     taken: u64,
     /// Rays against what stands still, if they have been traced already.
@@ -1748,6 +1780,12 @@ impl Hull {
         let nearest = position.clamp(self.bounds[0], self.bounds[1]);
         position.distance_squared(self.center) <= far * far
             && nearest.distance_squared(position) <= reach * reach * 1.0001
+    }
+
+    /// At least so far from a place to its surface, metres.
+    fn distance(&self, position: Vec3) -> f32 {
+        let to_box = position.distance(position.clamp(self.bounds[0], self.bounds[1]));
+        to_box.max(position.distance(self.center) - self.radius)
     }
 
     /// Which part of a point's rays, about, go to the ball: above 0.
