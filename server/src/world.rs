@@ -50,8 +50,8 @@ pub struct Options {
     pub rays: usize,
     /// Rays that a step spends on points near what moves, about; `u64::MAX` for all that they
     /// need. Where that is less, those have their turn first whose lag is likely to show most; some
-    /// change as points around them do, before they are traced themselves; and
-    /// all are up to date some steps after the last move. May be changed between steps.
+    /// change as points around them do before they are traced themselves; and all are up to date
+    /// some steps after the last move. May be changed between steps.
     pub refresh_rays: u64,
     /// Kernel that the grid is laid out for.
     pub kernel: Kernel,
