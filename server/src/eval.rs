@@ -10,7 +10,7 @@ pub mod kernels;
 mod variants;
 
 use crate::args::{Layout, PlacementArg, ProfileArg, SceneArgs, camera_path};
-use crate::camera::{CameraPath, Frustum};
+use crate::camera::{Camera, CameraPath, Frustum};
 use crate::demo::parse_size;
 use crate::encode::{Compression, Encoder, Eye, Limits, Scheme, View as Sight, capacity_of};
 use crate::metrics::Pair;
@@ -111,6 +111,9 @@ pub struct EvalArgs {
     /// Which of the two camera paths to walk: tune (or 0) and check (or 1)
     #[arg(long, value_name = "PATH", default_value = "check", value_parser = parse_path)]
     pub path: u32,
+    /// The camera stands where the path begins: steady frames hold only what movers change
+    #[arg(long, conflicts_with = "kernels")]
+    pub standing: bool,
     /// Frames at each rate that are compared with a ray-traced picture
     #[arg(long, value_name = "N", default_value_t = 2,
           value_parser = clap::value_parser!(u32).range(1..=64))]
@@ -242,6 +245,8 @@ pub struct Evaluation {
     pub frames: u32,
     /// Camera path.
     pub path: u32,
+    /// The camera stood where it begins.
+    pub standing: bool,
     /// One a profile, density, rate and quantiser.
     pub rows: Vec<Row>,
     /// One a density and rate, if both profiles were measured.
@@ -289,6 +294,7 @@ pub fn run(args: &EvalArgs, progress: Progress<'_>) -> Result<Evaluation, String
     let mut found = Evaluation {
         frames: args.frames,
         path: args.path,
+        standing: args.standing,
         ..Evaluation::default()
     };
     let one = [args.scene.density];
@@ -375,9 +381,14 @@ impl Bench<'_> {
             .rates
             .iter()
             .flat_map(|&rate| (0..args.frames).map(move |frame| f64::from(frame) / rate))
-            .map(|time| view(&path, time))
+            .map(|time| view(&args.camera(&path, time)))
             .collect();
-        let seen = |[min, max]: [Vec3; 2]| views.iter().any(|view| view.sees_box(min, max));
+        // Movers may come into view wherever they are now.
+        let movers = bounds_of_movers(&world);
+        let seen = |[min, max]: [Vec3; 2]| {
+            let within = |of: &[Vec3; 2]| of[0].cmple(min).all() && max.cmple(of[1]).all();
+            movers.iter().any(within) || views.iter().any(|view| view.sees_box(min, max))
+        };
         let converging = |done, total| progress(&stage("convergence"), done, total);
         world.converge(&seen, world.options.rays, &converging);
 
@@ -415,14 +426,15 @@ impl Bench<'_> {
         let (mut step_ms, mut rays) = (Vec::new(), Vec::new());
         for frame in 0..args.frames {
             let time = f64::from(frame) / rate_hz;
-            let view = view(path, time);
+            let camera = args.camera(path, time);
+            let view = view(&camera);
             let visible = |[min, max]: [Vec3; 2]| view.sees_box(min, max);
             let sight = Sight {
                 sees: &visible,
-                eye: Some(Eye::of(&path.at(time), args.size.1 as u32)),
+                eye: Some(Eye::of(&camera, args.size.1 as u32)),
             };
             let start = Instant::now();
-            world.eyes = vec![path.at(time).position];
+            world.eyes = vec![camera.position];
             let finest = &mut world.finest_levels;
             finest.clear();
             finest.resize(world.scene.instances.len(), LEVELS);
@@ -442,7 +454,6 @@ impl Bench<'_> {
             let pictures = args.pictures.min(steady);
             let middle = |i| first + (2 * i + 1) * steady / (2 * pictures);
             if (0..pictures).any(|i| middle(i) == frame) {
-                let camera = path.at(time);
                 let view = View::new(world, &camera, args.size.0, args.size.1);
                 let key = (rate_hz.to_bits(), frame);
                 let trace = || view.trace(world, &self.samples);
@@ -478,8 +489,29 @@ impl Bench<'_> {
     }
 }
 
-fn view(path: &CameraPath, time_s: f64) -> Frustum {
-    Frustum::new(&path.at(time_s), MARGIN_DEGREES.to_radians())
+impl EvalArgs {
+    /// The camera at a time.
+    fn camera(&self, path: &CameraPath, time_s: f64) -> Camera {
+        path.at(if self.standing { 0.0 } else { time_s })
+    }
+}
+
+/// World bounds of all points of each instance that moves, now.
+fn bounds_of_movers(world: &World) -> Vec<[Vec3; 2]> {
+    let movers = (0..).zip(world.moves()).filter(|(_, moves)| **moves);
+    let bounds = |(instance, _)| {
+        let slices = world.slices_of(instance);
+        let slices = &world.slices[slices.start as usize..slices.end as usize];
+        slices
+            .iter()
+            .map(|slice| slice.bounds)
+            .reduce(|a, b| [a[0].min(b[0]), a[1].max(b[1])])
+    };
+    movers.filter_map(bounds).collect()
+}
+
+fn view(camera: &Camera) -> Frustum {
+    Frustum::new(camera, MARGIN_DEGREES.to_radians())
 }
 
 /// Checks that streams side by side have room.
@@ -946,9 +978,9 @@ impl Evaluation {
         let plot = |(run, mut rows): (String, Vec<&Row>)| {
             rows.sort_by(|a, b| a.density.total_cmp(&b.density));
             let costs: [(&str, fn(&Row) -> f64); 5] = [
-                ("step", |row| row.step_ms),
+                ("server frame", |row| row.frame_ms),
                 ("select and encode", |row| row.select_ms + row.encode_ms),
-                ("decode", |row| row.decode_ms),
+                ("client frame", |row| row.decode_ms),
                 ("Mbit/s", |row| row.mbit_per_s),
                 ("Mbit/s, topology shipped", |row| {
                     row.mbit_per_s - row.mbit_per_s_topology

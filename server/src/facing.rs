@@ -103,6 +103,11 @@ impl Cone {
         [all, any]
     }
 
+    /// The middle of its normals: of unit length, or zero where they point everywhere.
+    pub fn axis(&self) -> Vec3 {
+        self.axis
+    }
+
     /// A ball around its points.
     pub fn ball(&self) -> (Vec3, f32) {
         (self.center, self.radius)

@@ -5,6 +5,7 @@
 //! against geometry that a point is rigidly attached to are traced once and kept as bits; the
 //! others again only when something moved within their reach.
 
+mod between;
 mod place;
 mod turns;
 
@@ -17,6 +18,7 @@ use crate::samples::Samples;
 use crate::scene::{InstancePose, Mesh, Pose, Scene};
 use crate::topology::{Adjacency, PointSet, SLICE_BLOCKS, Topology};
 use crate::truth::{Place, Placement, Truth, choose_buckets, fit};
+use between::{Between, THIN};
 use glam::{Affine3A, DAffine3, Vec3, Vec3A};
 use place::{
     Placed, Sampled, distinct_cells, extent, place_instances, place_points, shared_points,
@@ -29,7 +31,7 @@ use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
 use std::sync::Arc;
-use turns::{Block, Due, Turn};
+use turns::{Block, Cost, Due, Turn};
 
 /// Points of a slice: the unit of visibility and of tracing.
 pub const SLICE_POINTS: usize = 1024;
@@ -47,8 +49,9 @@ pub struct Options {
     /// Rays a point, 1 to 4096.
     pub rays: usize,
     /// Rays that a step spends on points near what moves, about; `u64::MAX` for all that they
-    /// need. Where that is less, those have their turn first whose lag is likely to show most, and
-    /// all are up to date some steps after the last move. May be changed between steps.
+    /// need. Where that is less, those have their turn first whose lag is likely to show most; some
+    /// change as points around them do before they are traced themselves; and all are up to date
+    /// some steps after the last move. May be changed between steps.
     pub refresh_rays: u64,
     /// Kernel that the grid is laid out for.
     pub kernel: Kernel,
@@ -255,6 +258,8 @@ pub struct World {
     turns: Vec<Turn>,
     /// The blocks of all slices, [`SLICE_BLOCKS`] each.
     blocks: Vec<Block>,
+    /// Of each instance.
+    costs: Vec<Cost>,
     /// [`World::finest_levels`] of the last step, of every instance.
     stepped_levels: Vec<u32>,
     /// Calls of [`World::step`].
@@ -325,6 +330,7 @@ impl World {
             swept: vec![[Hull::default(); 2]; scene.instances.len()],
             turns: Vec::new(),
             blocks: Vec::new(),
+            costs: vec![Cost::default(); scene.instances.len()],
             eyes: Vec::new(),
             finest_levels: Vec::new(),
             stepped_levels: vec![0; scene.instances.len()],
@@ -916,32 +922,6 @@ impl World {
         stats
     }
 
-    /// The blocks of a slice from which a ray may meet what moves.
-    fn near_movers(&self, slice: &Slice) -> u64 {
-        let instance = slice.instance as usize;
-        let Some(cones) = self.cones_at(slice).filter(|_| !self.moves[instance]) else {
-            return u64::MAX;
-        };
-        let reach = self.options.ao_distance_m;
-        let movers = (0..self.moves.len()).filter(|&mover| self.moves[mover]);
-        let movers = movers.map(|mover| &self.swept[mover][0]);
-        let movers: Vec<&Hull> = movers
-            .filter(|mover| mover.is_near(slice.bounds, reach))
-            .collect();
-        let world = &self.pose.instances[instance].world_from_local;
-        let stretch = stretch(world);
-        let is_near = |cone: &Cone| {
-            let (center, radius) = cone.ball();
-            let center = world.transform_point3(center);
-            // A little more, for rounding.
-            let around = radius * stretch * 1.001 + center.abs().max_element() * 1e-5;
-            let bounds = [center - around, center + around];
-            movers.iter().any(|mover| mover.is_near(bounds, reach))
-        };
-        let near = cones.iter().rev().map(is_near);
-        near.fold(0, |blocks, near| blocks << 1 | u64::from(near))
-    }
-
     /// Traces blocks, slice by slice in order. How many rays and points.
     fn trace_due(&mut self, due: &[Due], report: &(dyn Fn(u64, u64) + Sync)) -> (u64, u64) {
         let words = self.words();
@@ -950,17 +930,18 @@ impl World {
             std::mem::take(&mut self.fixed),
             std::mem::take(&mut self.traced),
         );
-        let parts = |due: &Due| -> Vec<(Range<u32>, u8)> {
+        let parts = |due: &Due| -> Vec<(Range<u32>, [u8; 2])> {
             let points = &self.slices[due.slice].points;
             let firsts = points.clone().step_by(BATCH_POINTS).enumerate();
             let parts = firsts.map(|(part, first)| {
                 let last = points.end.min(first + BATCH_POINTS as u32);
-                let blocks = due.blocks >> (part * BATCH_POINTS / BLOCK);
-                (first..last, blocks as u8)
+                let first_block = part * BATCH_POINTS / BLOCK;
+                let own = [due.blocks, due.thin].map(|blocks| (blocks >> first_block) as u8);
+                (first..last, own)
             });
-            parts.filter(|(_, blocks)| *blocks > 0).collect()
+            parts.filter(|(_, [blocks, _])| *blocks > 0).collect()
         };
-        let parts: Vec<(&Due, Range<u32>, u8)> = due
+        let parts: Vec<(&Due, Range<u32>, [u8; 2])> = due
             .iter()
             .flat_map(|due| parts(due).into_iter().map(move |(p, b)| (due, p, b)))
             .collect();
@@ -968,7 +949,7 @@ impl World {
         traced.resize(total, 0);
         let mut batches = Vec::with_capacity(parts.len());
         let (mut bits, mut bits_from, mut occlusion) = (&mut fixed[..], 0, &mut traced[..]);
-        for (due, points, blocks) in parts {
+        for (due, points, [blocks, thin]) in parts {
             let from = points.start as usize * words;
             let skipped = bits.split_at_mut(from - bits_from).1;
             let (own, rest) = skipped.split_at_mut(points.len() * words);
@@ -980,7 +961,8 @@ impl World {
                 points,
                 rays: due.rays,
                 blocks,
-                block_rays: [0; BATCH_POINTS / BLOCK],
+                thin,
+                taken: 0,
                 still: None,
                 fixed: own,
                 occlusion: own_occlusion,
@@ -1010,10 +992,11 @@ impl World {
             let whole = due.rays > slice.rays_done
                 || Some(self.finest_level(slice.instance)) <= self.level_of(slice.instance);
             let turn = &mut self.turns[due.slice];
-            turn.owed &= !due.blocks;
-            turn.had = turn.had & !due.blocks | turn.near & due.blocks;
+            let exact = due.blocks & !due.thin;
+            turn.owed &= !exact;
+            turn.had = turn.had & !exact | turn.near & due.blocks;
             if whole {
-                turn.missed &= !due.blocks;
+                turn.missed &= !exact;
             } else {
                 turn.missed |= due.blocks;
             }
@@ -1035,6 +1018,9 @@ impl World {
         let slice = &self.slices[batch.slice];
         let first = (batch.points.start - slice.points.start) as usize / BLOCK;
         let gained = batch.rays > slice.rays_done;
+        if !gained {
+            self.costs[slice.instance as usize].traced += batch.taken as f32;
+        }
         let mut changed = 0;
         for (number, occlusion) in batch.occlusion.chunks(BLOCK).enumerate() {
             if batch.blocks >> number & 1 == 0 {
@@ -1059,7 +1045,7 @@ impl World {
                 let rate = change / block.age(self.steps).max(1.0);
                 // One step without a change says little of the next.
                 block.rate = rate.max(block.rate * 0.5);
-                block.rays = batch.block_rays[number];
+                block.note_turn(batch.thin >> number & 1 == 1, change);
             }
             block.traced_at = self.steps;
         }
@@ -1167,12 +1153,17 @@ impl World {
             .collect();
         let (mut todo, mut hit, mut known) = (vec![0; words], vec![0; words], vec![0; words]);
         let (mut rays_traced, mut points_traced) = (batch.still.unwrap_or(0), 0);
+        let first_block = (batch.points.start - slice.points.start) as usize / BLOCK;
+        let turns = &self.blocks[batch.slice * SLICE_BLOCKS + first_block..];
+        let mut between = [Between::default(); BATCH_POINTS / BLOCK];
+        let mut untraced: Vec<(usize, Vec3, Vec3)> = Vec::new();
         let parts = batch
             .fixed
             .chunks_exact_mut(words)
             .zip(&mut *batch.occlusion);
         for (number, (fixed, occlusion)) in batch.points.clone().zip(parts) {
-            let block = (number - batch.points.start) as usize / BLOCK;
+            let index = (number - batch.points.start) as usize;
+            let block = index / BLOCK;
             if batch.blocks >> block & 1 == 0 {
                 continue;
             }
@@ -1196,9 +1187,14 @@ impl World {
                 *occlusion = openness(fixed, rays);
                 continue;
             }
+            let thin = batch.thin >> block & 1 == 1;
+            if thin && index % THIN != usize::from(turns[block].number) % THIN {
+                untraced.push((index, position, normal));
+                *occlusion = openness(fixed, rays);
+                continue;
+            }
             let fan = self.fan(&surface, number, position, normal);
             points_traced += 1;
-            let before = rays_traced;
             hit.fill(0);
             if let Some(attached) = attached {
                 if converging && batch.still.is_none() {
@@ -1224,9 +1220,21 @@ impl World {
                 self.tracer
                     .occluded_fan(others, &fan, t_max, &todo, &mut hit);
             }
-            batch.block_rays[block] += (rays_traced - before) as u32;
             *occlusion = openness(&hit, rays);
+            if thin {
+                let before = self.occlusion[number as usize];
+                let change = f32::from(*occlusion) - f32::from(before);
+                between[block].learn(position, normal, change);
+            }
         }
+        let before = &self.occlusion[batch.points.start as usize..];
+        for (index, position, normal) in untraced {
+            let change = between[index / BLOCK].change_at(position, normal);
+            // Not more open than without what moves.
+            let most = &mut batch.occlusion[index];
+            *most = ((f32::from(before[index]) + change).round() as u8).min(*most);
+        }
+        batch.taken = rays_traced;
         (rays_traced, points_traced)
     }
 
@@ -1690,8 +1698,10 @@ struct Batch<'a> {
     rays: usize,
     /// Which of its blocks.
     blocks: u8,
-    /// Rays that each took.
-    block_rays: [u32; BATCH_POINTS / BLOCK],
+    /// Those of them of which one point in [`THIN`] is traced.
+    thin: u8,
+    /// Rays that it took.
+    taken: u64,
     /// Rays against what stands still, if they have been traced already.
     still: Option<u64>,
     /// Their part of [`World::fixed`].
@@ -1783,6 +1793,21 @@ impl Hull {
         let nearest = position.clamp(self.bounds[0], self.bounds[1]);
         position.distance_squared(self.center) <= far * far
             && nearest.distance_squared(position) <= reach * reach * 1.0001
+    }
+
+    /// At least so far from a place to its surface, metres.
+    fn distance(&self, position: Vec3) -> f32 {
+        let to_box = position.distance(position.clamp(self.bounds[0], self.bounds[1]));
+        to_box.max(position.distance(self.center) - self.radius)
+    }
+
+    /// Which part of a point's rays, about, go to the ball: above 0.
+    fn share(&self, position: Vec3, normal: Vec3) -> f32 {
+        let to = self.center - position;
+        let sin = (self.radius / to.length().max(f32::MIN_POSITIVE)).min(1.0);
+        // Right where all of it is ahead, or it is half of all that can be seen.
+        let ahead = (normal.dot(to.normalize_or_zero()) + sin) / (1.0 + sin);
+        (sin * sin * ahead).max(1e-3)
     }
 
     /// Part of it is above the plane at a place.

@@ -329,6 +329,29 @@ fn points_that_take_turns_are_all_up_to_date_some_steps_after_the_last_move() {
     }
 }
 
+#[test]
+fn a_step_spends_the_rays_that_it_may_however_dense_and_new_the_points_are() {
+    const BUDGET: u64 = 100_000;
+    let mut world = world(small_scene(), laid_out(options(2560.0, 64), residual()));
+    converge(&mut world);
+    world.options.refresh_rays = BUDGET;
+    let mut spent = Vec::new();
+    for step in 1..=20 {
+        let stats = world.step(f64::from(step) * 0.05, &all, 0);
+        assert!(stats.waiting > 0, "step {step}: all had their turn");
+        spent.push(stats.rays as f64 / BUDGET as f64);
+    }
+    // Nothing was known before the first.
+    for (step, spent) in (1..).zip(&spent).skip(1) {
+        assert!(*spent < 1.5, "step {step}: {spent} of the budget");
+    }
+    let mean = spent[1..].iter().sum::<f64>() / (spent.len() - 1) as f64;
+    assert!(
+        (0.85..1.15).contains(&mean),
+        "{mean} of the budget: {spent:?}"
+    );
+}
+
 /// To the bit.
 fn says_the_same(a: &World, b: &World) -> bool {
     let mut slices = a.slices.iter().zip(&b.slices);
@@ -353,7 +376,7 @@ fn a_step_with_few_rays_spends_them_where_most_has_changed() {
     for step in 1..=20 {
         let time = f64::from(step) * 0.05;
         rays[1] += at_once.step(time, &all, 0).rays;
-        in_turns.options.refresh_rays = rays[1] / step as u64 * 3 / 8;
+        in_turns.options.refresh_rays = rays[1] / step as u64 * 15 / 64;
         rays[0] += in_turns.step(time, &all, 0).rays;
         // All of it, in every fourth step.
         if step % 4 == 0 {
