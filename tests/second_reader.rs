@@ -155,16 +155,13 @@ fn read_stream(bytes: &[u8], room: Room, kept: &mut Kept, out: &mut Read) -> Res
             }
             2 | 5 => {
                 // 5.1
-                if body.len() < 24 {
+                if body.len() < 20 {
                     return Err("5.1: length".into());
                 }
                 let (id, time_ns) = (u32_at(body, 0), u64_at(body, 4));
-                let (mirror_hash, raw_bytes) = (u64_at(body, 12), u32_at(body, 20));
+                let mirror_hash = u64_at(body, 12);
                 let (snapshot, last) = (flags & 1 != 0, flags & 2 != 0);
                 let header = header.as_ref().expect("checked above");
-                if raw_bytes > header.max_raw_bytes {
-                    return Err("5.1: raw_bytes".into());
-                }
                 if !last && mirror_hash != 0 {
                     return Err("5.5: a hash before the last packet".into());
                 }
@@ -188,12 +185,9 @@ fn read_stream(bytes: &[u8], room: Room, kept: &mut Kept, out: &mut Read) -> Res
                     continue; // 5.6: withheld
                 }
                 if kind == 2 {
-                    apply(&body[24..], raw_bytes, header, &slices, &mut mirror)?;
+                    apply(&body[20..], header, &slices, &mut mirror)?;
                 } else {
-                    if body.len() - 24 != raw_bytes as usize {
-                        return Err("15.5: raw_bytes".into());
-                    }
-                    apply_items(&body[24..], header, &kept.patches, &mut mirror, &mut slices)?;
+                    apply_items(&body[20..], header, &kept.patches, &mut mirror, &mut slices)?;
                 }
                 if !last {
                     continue;
@@ -288,19 +282,21 @@ fn read_header(body: &[u8], room: Room) -> Result<Header, String> {
 
 /// Section 6.
 fn apply(
-    compressed: &[u8],
-    raw_bytes: u32,
+    content: &[u8],
     header: &Header,
     slices: &BTreeMap<u32, Slice>,
     mirror: &mut [Buffer; 3],
 ) -> Result<(), String> {
     let lengths = header.lengths;
-    if raw_bytes == 0 {
-        return if compressed.is_empty() {
-            Ok(())
-        } else {
-            Err("6.1: content".into())
-        };
+    if content.is_empty() {
+        return Ok(());
+    }
+    let Some((raw_bytes, compressed)) = content.split_at_checked(4) else {
+        return Err("6.1: length".into());
+    };
+    let raw_bytes = u32_at(raw_bytes, 0);
+    if raw_bytes == 0 || raw_bytes > header.max_raw_bytes {
+        return Err("6.1: raw_bytes".into());
     }
     // 6.1: one frame, not a skippable one, and nothing behind it.
     let frame = zstd::zstd_safe::find_frame_compressed_size(compressed);

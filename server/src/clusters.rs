@@ -15,7 +15,7 @@ pub const MOST: usize = 512;
 const OPPOSITE: f32 = 120.0 * 32.0;
 
 /// Few points that face another way are not worth a patch of their own.
-const LEAST: usize = 64;
+const LEAST: usize = 128;
 
 /// Puts points that make up a patch one behind the other, and says how many each has:
 /// [`MOST`] at most. The same on any number of threads.

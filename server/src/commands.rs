@@ -531,7 +531,6 @@ pub fn inspect(args: &InspectArgs, out: &mut dyn Write) -> Result<(), String> {
                         id,
                         time_ns,
                         mirror_hash,
-                        ..
                     } = frame;
                     let seconds = time_ns as f64 / 1e9;
                     let line = format!(

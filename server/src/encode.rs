@@ -202,7 +202,7 @@ impl Encoder {
             kernel: world.options.kernel,
             scene_hash,
             capacity: capacity_of(world),
-            max_body_bytes: (FRAME_HEADER_BYTES + compress_bound(RAW_BYTES)) as u32,
+            max_body_bytes: (FRAME_HEADER_BYTES + 4 + compress_bound(RAW_BYTES)) as u32,
             max_raw_bytes: RAW_BYTES as u32,
             ao_distance_m: world.options.ao_distance_m,
             density: world.options.density as f32,
@@ -289,7 +289,7 @@ impl Encoder {
         };
         let wanted = always || self.snapshot || out.len() > start;
         if packets.is_empty() && wanted {
-            packets.push((kind::FRAME, 0, Vec::new()));
+            packets.push((kind::FRAME, Vec::new()));
         }
         if !packets.is_empty() {
             let packing = Instant::now();
@@ -305,14 +305,13 @@ impl Encoder {
         stats
     }
 
-    fn write_frame(&mut self, packets: &[(u8, usize, Vec<u8>)], time_ns: u64, out: &mut Vec<u8>) {
-        for (index, (kind, raw_bytes, body)) in packets.iter().enumerate() {
+    fn write_frame(&mut self, packets: &[(u8, Vec<u8>)], time_ns: u64, out: &mut Vec<u8>) {
+        for (index, (kind, body)) in packets.iter().enumerate() {
             let mut flags = 0;
             let mut frame = Frame {
                 id: self.frame_id,
                 time_ns,
                 mirror_hash: 0,
-                raw_bytes: *raw_bytes as u32,
             };
             if self.snapshot {
                 flags |= flag::SNAPSHOT;
@@ -525,12 +524,13 @@ fn compressor(compression: Compression) -> CCtx<'static> {
     zstd
 }
 
+/// The content of a frame packet.
 fn compress(zstd: &mut CCtx<'_>, raw: &[u8]) -> Vec<u8> {
     if raw.is_empty() {
         return Vec::new();
     }
-    let mut out = Vec::with_capacity(compress_bound(raw.len()));
-    zstd.compress2(&mut out, raw)
+    let mut compressed = Vec::with_capacity(compress_bound(raw.len()));
+    zstd.compress2(&mut compressed, raw)
         .expect("zstd has the room it asked for");
-    out
+    [&(raw.len() as u32).to_le_bytes(), compressed.as_slice()].concat()
 }

@@ -501,7 +501,7 @@ fn content_is_exactly_one_zstd_frame() {
     assert_eq!(outcome(bytes, &good), None);
     assert_eq!(outcome(bytes - 1, &good), compression);
     assert_eq!(outcome(bytes + 1, &good), compression);
-    assert_eq!(outcome(0, &good), Some(StreamError::Length.into()));
+    assert_eq!(outcome(0, &good), Some(StreamError::Value.into()));
     assert_eq!(outcome(bytes, &[]), compression);
     assert_eq!(outcome(bytes, &raw), compression);
     for length in 1..good.len() {

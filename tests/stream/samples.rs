@@ -261,27 +261,19 @@ impl Hand {
     }
 
     pub fn compressed(&mut self, flags: u8, id: u32, hash: u64, raw_bytes: u32, content: &[u8]) {
-        self.part(kind::FRAME, flags, id, hash, raw_bytes, content);
+        let content = [&raw_bytes.to_le_bytes(), content].concat();
+        self.part(kind::FRAME, flags, id, hash, &content);
     }
 
     pub fn slices(&mut self, flags: u8, id: u32, hash: u64, items: &[u8]) {
-        self.part(kind::SLICES, flags, id, hash, items.len() as u32, items);
+        self.part(kind::SLICES, flags, id, hash, items);
     }
 
-    pub fn part(
-        &mut self,
-        kind: u8,
-        flags: u8,
-        id: u32,
-        hash: u64,
-        raw_bytes: u32,
-        content: &[u8],
-    ) {
+    pub fn part(&mut self, kind: u8, flags: u8, id: u32, hash: u64, content: &[u8]) {
         let frame = Frame {
             id,
             time_ns: u64::from(id) * 1000,
             mirror_hash: hash,
-            raw_bytes,
         };
         let mut body = vec![0; FRAME_HEADER_BYTES];
         frame.write(&mut Writer::new(&mut body)).unwrap();
@@ -370,7 +362,7 @@ pub fn by_hand() -> Sample {
     let whole = hash_after(&parts);
     let with_away = [&parts[..], std::slice::from_ref(&away)].concat();
     hand.frame(flag::LAST, 41, whole, &parts[2]);
-    hand.compressed(flag::LAST, 42, whole, 0, &[]);
+    hand.part(kind::FRAME, flag::LAST, 42, whole, &[]);
     hand.frame(flag::LAST, 43, hash_after(&with_away), &away);
     hand.packet(kind::END, 0, &[]);
     let mut rest = &hand.bytes[..];

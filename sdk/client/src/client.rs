@@ -539,10 +539,10 @@ impl Decoder {
     }
 
     fn frame(&mut self, header: &Header, packet: Packet<'_>) -> Result<Option<Frame>, ClientError> {
-        let (frame, compressed) = Frame::read(packet.body)?;
+        let (frame, content) = Frame::read(packet.body)?;
         let has = |flag: u8| packet.flags & flag != 0;
         let (snapshot, last) = (has(flag::SNAPSHOT), has(flag::LAST));
-        if frame.raw_bytes > header.max_raw_bytes || !last && frame.mirror_hash != 0 {
+        if !last && frame.mirror_hash != 0 {
             return Err(StreamError::Value.into());
         }
         let in_order = match self.open_frame {
@@ -564,15 +564,17 @@ impl Decoder {
             return Ok(None);
         }
         self.partial = true;
-        let raw_bytes = frame.raw_bytes as usize;
         if packet.kind == kind::SLICES {
-            if raw_bytes != compressed.len() {
-                return Err(StreamError::Length.into());
-            }
             let slices = &mut self.slices.slices();
-            let count = apply_slices(compressed, header.step, &mut self.mirror, slices)?;
+            let count = apply_slices(content, header.step, &mut self.mirror, slices)?;
             self.stats.slices += u64::from(count);
-        } else if raw_bytes > 0 {
+        } else if !content.is_empty() {
+            let mut reader = Reader(content);
+            let raw_bytes = reader.u32()?;
+            if raw_bytes == 0 || raw_bytes > header.max_raw_bytes {
+                return Err(StreamError::Value.into());
+            }
+            let (raw_bytes, compressed) = (raw_bytes as usize, reader.0);
             let room = &mut self.raw[..raw_bytes];
             psao_zstd::decompress(&mut self.zstd, room, compressed)
                 .map_err(|_| ClientError::Compression)?;
@@ -587,8 +589,6 @@ impl Decoder {
             self.stats.instances += u64::from(changes.instances);
             self.stats.buckets += u64::from(changes.buckets);
             self.stats.cells += u64::from(changes.cells);
-        } else if !compressed.is_empty() {
-            return Err(StreamError::Length.into());
         }
         if !last {
             return Ok(None);
@@ -609,6 +609,6 @@ impl Decoder {
 }
 
 const _: () = assert!(
-    MAX_BODY_BYTES as usize > FRAME_HEADER_BYTES + CHANGES_HEADER_BYTES,
+    MAX_BODY_BYTES as usize > FRAME_HEADER_BYTES + 4 + CHANGES_HEADER_BYTES,
     "a frame packet has room for content"
 );

@@ -1133,6 +1133,6 @@ mod tests {
                 sides[1].last.iter().for_each(|last| add(*last as u8));
             }
         }
-        assert_eq!(hash, 2408779542863590932);
+        assert_eq!(hash, 9088651711596666900);
     }
 }

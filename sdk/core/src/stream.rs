@@ -34,8 +34,8 @@ pub const MAX_BODY_BYTES: u32 = 1 << 22;
 /// Largest decompressed content of a frame packet.
 pub const MAX_RAW_BYTES: u32 = 1 << 22;
 
-/// Bytes of a frame packet's body before its compressed content.
-pub const FRAME_HEADER_BYTES: usize = 24;
+/// Bytes of a frame's or a slices packet's body before its content.
+pub const FRAME_HEADER_BYTES: usize = 20;
 
 /// What a packet is.
 pub mod kind {
@@ -180,8 +180,6 @@ pub struct Frame {
     pub time_ns: u64,
     /// [`Mirror::hash`] after the frame; 0 in all but its last packet.
     pub mirror_hash: u64,
-    /// Bytes of the decompressed content.
-    pub raw_bytes: u32,
 }
 
 /// Why a server will not serve a client.
@@ -441,24 +439,22 @@ impl Header {
 }
 
 impl Frame {
-    /// Reads a frame packet's body: the frame's fields, and the compressed content after them.
+    /// Reads the body of a frame's or a slices packet: the frame's fields, and the content after them.
     pub fn read(body: &[u8]) -> Result<(Frame, &[u8]), StreamError> {
         let mut r = Reader(body);
         let frame = Frame {
             id: r.u32()?,
             time_ns: r.u64()?,
             mirror_hash: r.u64()?,
-            raw_bytes: r.u32()?,
         };
         Ok((frame, r.0))
     }
 
-    /// Writes the fields before the compressed content.
+    /// Writes the fields before the content.
     pub fn write(&self, w: &mut Writer<'_>) -> Result<(), StreamError> {
         w.u32(self.id)?;
         w.u64(self.time_ns)?;
-        w.u64(self.mirror_hash)?;
-        w.u32(self.raw_bytes)
+        w.u64(self.mirror_hash)
     }
 }
 

@@ -89,7 +89,7 @@ impl Cells {
         world: &World,
         view: &View<'_>,
         stats: &mut FrameStats,
-    ) -> Vec<(u8, usize, Vec<u8>)> {
+    ) -> Vec<(u8, Vec<u8>)> {
         let truth = &world.truth;
         self.select(world, view);
         let instances: Vec<(u32, Instance)> = (0..truth.instances.len())
@@ -123,7 +123,7 @@ impl Cells {
             .par_iter()
             .map_init(
                 || compressor(self.compression),
-                |zstd, raw| (kind::FRAME, raw.len(), compress(zstd, raw)),
+                |zstd, raw| (kind::FRAME, compress(zstd, raw)),
             )
             .collect();
         stats.encode_ns += start.elapsed().as_nanos() as u64;

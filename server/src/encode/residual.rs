@@ -92,8 +92,8 @@ struct Fade {
 pub struct Packets {
     /// Bodies of patches packets.
     pub patches: Vec<Vec<u8>>,
-    /// Kind, bytes before compression, and content of the frame's packets.
-    pub packets: Vec<(u8, usize, Vec<u8>)>,
+    /// Kind and content of the frame's packets.
+    pub packets: Vec<(u8, Vec<u8>)>,
 }
 
 /// A slice that the client lacks something of.
@@ -930,7 +930,7 @@ impl Frame {
             write_content(&mut Writer::new(&mut raw), &self.instances, &[], &[])
                 .expect("content has the room counted");
             let compressed = compress(&mut compressor(Compression::Fast), &raw);
-            packets.push((kind::FRAME, raw.len(), compressed));
+            packets.push((kind::FRAME, compressed));
         }
         packets.append(&mut items.packets());
         Packets {
@@ -968,11 +968,9 @@ impl Bodies {
         *next = index + 1;
     }
 
-    fn packets(self) -> Vec<(u8, usize, Vec<u8>)> {
+    fn packets(self) -> Vec<(u8, Vec<u8>)> {
         let bodies = self.0.into_iter();
-        bodies
-            .map(|(body, _)| (kind::SLICES, body.len(), body))
-            .collect()
+        bodies.map(|(body, _)| (kind::SLICES, body)).collect()
     }
 }
 
