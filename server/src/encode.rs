@@ -20,8 +20,8 @@ use psao::memory::{Heap, SliceHeap};
 use psao_core::mirror::Capacity;
 use psao_core::residual::Quantiser;
 use psao_core::stream::{
-    self, FRAME_HEADER_BYTES, Frame, Header, PACKET_HEADER_BYTES, PREAMBLE, Profile, StreamError,
-    Writer, flag, kind, write_packet,
+    self, FRAME_HEADER_BYTES, Frame, Header, PACKET_HEADER_BYTES, PREAMBLE, Profile,
+    RAW_LENGTH_BYTES, StreamError, Writer, flag, kind, write_packet,
 };
 use psao_core::{Bucket, Cell, Instance, Mirror};
 use rayon::prelude::*;
@@ -202,7 +202,8 @@ impl Encoder {
             kernel: world.options.kernel,
             scene_hash,
             capacity: capacity_of(world),
-            max_body_bytes: (FRAME_HEADER_BYTES + 4 + compress_bound(RAW_BYTES)) as u32,
+            max_body_bytes: (FRAME_HEADER_BYTES + RAW_LENGTH_BYTES + compress_bound(RAW_BYTES))
+                as u32,
             max_raw_bytes: RAW_BYTES as u32,
             ao_distance_m: world.options.ao_distance_m,
             density: world.options.density as f32,

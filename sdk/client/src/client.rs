@@ -6,7 +6,8 @@ use psao_core::mirror::Capacity;
 use psao_core::slices::{apply_instances, apply_patches, apply_slices};
 use psao_core::stream::{
     CHANGES_HEADER_BYTES, FRAME_HEADER_BYTES, Frame, Header, MAX_BODY_BYTES, PACKET_HEADER_BYTES,
-    PREAMBLE, Packet, Profile, Reader, Refusal, StreamError, apply_changes, flag, kind,
+    PREAMBLE, Packet, Profile, RAW_LENGTH_BYTES, Reader, Refusal, StreamError, apply_changes, flag,
+    kind,
 };
 
 /// What a client may use at most.
@@ -609,6 +610,6 @@ impl Decoder {
 }
 
 const _: () = assert!(
-    MAX_BODY_BYTES as usize > FRAME_HEADER_BYTES + 4 + CHANGES_HEADER_BYTES,
+    MAX_BODY_BYTES as usize > FRAME_HEADER_BYTES + RAW_LENGTH_BYTES + CHANGES_HEADER_BYTES,
     "a frame packet has room for content"
 );

@@ -37,6 +37,9 @@ pub const MAX_RAW_BYTES: u32 = 1 << 22;
 /// Bytes of a frame's or a slices packet's body before its content.
 pub const FRAME_HEADER_BYTES: usize = 20;
 
+/// Bytes of a frame packet's content before what is compressed: the length that this will have.
+pub const RAW_LENGTH_BYTES: usize = 4;
+
 /// What a packet is.
 pub mod kind {
     /// Parameters of the stream: always the first packet. [`super::Header`].
