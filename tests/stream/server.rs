@@ -26,7 +26,7 @@ pub fn all(_: [Vec3; 2]) -> bool {
 }
 
 /// No point is off by as much while its slice waits for being a little off.
-const LITTLE: u8 = 8 * (QUANTISER.dead_zone + 1);
+const LITTLE: u8 = 5 * (QUANTISER.dead_zone + 1);
 
 /// Frames that a slice waits at most.
 const PATIENCE: u32 = 3;

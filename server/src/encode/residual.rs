@@ -53,6 +53,9 @@ const FADE_S: f32 = 0.4;
 /// squares of the least difference that counts: what comes of it later costs hardly more bits.
 const LITTLE: u64 = 60;
 
+/// And none of its points by as many, so that none sticks out.
+const LITTLE_A_POINT: u64 = 25;
+
 /// No slice waits longer for being little off.
 const WAIT_S: f32 = 0.1;
 
@@ -353,12 +356,13 @@ impl Residual {
             lack.blocks = faces.any;
             shows &= faces.any;
         }
-        let squares = differences.squares(&in_picture(world, view, slice, faces, &differences.off));
+        let [squares, most] =
+            differences.squares(&in_picture(world, view, slice, faces, &differences.off));
         lack.weight = (squares as f32 + f32::from(u8::from(shows != 0))) / near();
         let off = match squares {
             _ if shows != 0 || fading => Off::Far,
             0 => Off::Near,
-            squares if self.waits(index, squares) => Off::Little,
+            _ if self.waits(index, squares, most) => Off::Little,
             _ => Off::Far,
         };
         if matches!(off, Off::Far) && !fading {
@@ -369,13 +373,16 @@ impl Residual {
         Some((lack, off))
     }
 
-    /// Whether a slice that is off by so much, squared and summed, may wait for more.
-    fn waits(&self, index: u32, squares: u64) -> bool {
+    /// Whether a slice that is off by so much, squared and summed and at most, may wait for more.
+    fn waits(&self, index: u32, squares: u64, most: u64) -> bool {
         let least = u64::from(self.quantiser.dead_zone) + 1;
         let waited =
             self.little_since[index as usize].map_or(0, |since| self.sight.frames() - since);
         // Without a dead zone nothing is to be off.
-        least > 1 && squares < LITTLE * least.pow(2) && waited < (WAIT_S * self.rate_hz) as u64
+        least > 1
+            && squares < LITTLE * least.pow(2)
+            && most < LITTLE_A_POINT * least.pow(2)
+            && waited < (WAIT_S * self.rate_hz) as u64
     }
 
     /// Takes instances from the client that are out of the scene.
@@ -863,18 +870,19 @@ impl Differences {
             .fold(0, |blocks, at| blocks << 1 | u64::from(block(at)))
     }
 
-    /// The sum of the squares of some of them.
-    fn squares(&self, of: &PointBits) -> u64 {
-        let mut sum = 0;
+    /// The sum of the squares of some of them, and the largest of these.
+    fn squares(&self, of: &PointBits) -> [u64; 2] {
+        let [mut sum, mut most] = [0, 0];
         for (word, points) in of.iter().enumerate() {
             let mut left = *points;
             while left != 0 {
                 let at = word * 64 + left.trailing_zeros() as usize;
                 left &= left - 1;
-                sum += u64::from(self.by[at]).pow(2);
+                let square = u64::from(self.by[at]).pow(2);
+                [sum, most] = [sum + square, square.max(most)];
             }
         }
-        sum
+        [sum, most]
     }
 }
 
