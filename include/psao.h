@@ -45,7 +45,7 @@
 #define PSAO_STREAM_VERSION 10000
 
 /* The longest message that psao_uplink_joints writes, with 4096 joints. */
-#define PSAO_UPLINK_MAX_BYTES 196632
+#define PSAO_UPLINK_MAX_BYTES 196628
 
 /* The longest message of any other psao_uplink_ function. */
 #define PSAO_UPLINK_SMALL_BYTES 384
@@ -435,7 +435,7 @@ uint32_t psao_abi_version(void);
  * Check the memory that it asks for against your own limit: a hostile server may ask for a lot.
  *
  * Returns PSAO_NEED_MORE, and writes nothing, until the bytes hold the first packet (the first
- * 4120 bytes always do).
+ * 4116 bytes always do).
  *
  * Threads: any. No alloc, lock or log. Safe on untrusted input. Since ABI 1. */
 psao_result psao_config_from_stream(const uint8_t *input,
@@ -778,7 +778,7 @@ psao_result psao_uplink_transform(struct psao_uplink *uplink,
  * local_from_rest: 12 floats a joint, three rows of four: what takes a vertex from rest space to
  * local space. joint_count: the skin's, at most 4096.
  *
- * out: 24 bytes and 48 a joint, at most PSAO_UPLINK_MAX_BYTES.
+ * out: 20 bytes and 48 a joint, at most PSAO_UPLINK_MAX_BYTES.
  *
  * PSAO_ERROR_VALUE: a value is not finite, or there are too many joints.
  *

@@ -82,7 +82,7 @@ fn read_stream(bytes: &[u8], room: Room, kept: &mut Kept, out: &mut Read) -> Res
     }
     let mut at = begin;
     let mut header: Option<Header> = None;
-    let mut sequence = 0u32;
+    let mut sequence = 0u16;
     let mut last_id: Option<u32> = None;
     let mut open: Option<(u32, u64)> = None;
     let mut live = false;
@@ -95,29 +95,25 @@ fn read_stream(bytes: &[u8], room: Room, kept: &mut Kept, out: &mut Read) -> Res
             return Err("3.2: bytes behind the end".into());
         }
         // 2.3
-        if at + 16 > bytes.len() {
+        if at + 12 > bytes.len() {
             return Ok(());
         }
         let (kind, flags) = (bytes[at], bytes[at + 1]);
-        let reserved = u16_at(bytes, at + 2);
         let body_bytes = u32_at(bytes, at + 4);
         let limit = header.as_ref().map_or(4096, |h| h.max_body_bytes);
         if body_bytes > limit {
             return Err("2.4: body_bytes".into());
         }
-        let end = at + 16 + body_bytes as usize;
+        let end = at + 12 + body_bytes as usize;
         if end > bytes.len() {
             return Ok(());
         }
-        let body = &bytes[at + 16..end];
-        let covered = [&bytes[at..at + 12], body].concat();
-        if crc32(&covered) != u32_at(bytes, at + 12) {
+        let body = &bytes[at + 12..end];
+        let covered = [&bytes[at..at + 8], body].concat();
+        if crc32(&covered) != u32_at(bytes, at + 8) {
             return Err("2.8: checksum".into());
         }
-        if reserved != 0 {
-            return Err("2.3: reserved".into());
-        }
-        if u32_at(bytes, at + 8) != sequence {
+        if u16_at(bytes, at + 2) != sequence {
             return Err("2.7: sequence".into());
         }
         sequence = sequence.wrapping_add(1);
@@ -155,14 +151,14 @@ fn read_stream(bytes: &[u8], room: Room, kept: &mut Kept, out: &mut Read) -> Res
             }
             2 | 5 => {
                 // 5.1
-                if body.len() < 20 {
+                if body.len() < 16 {
                     return Err("5.1: length".into());
                 }
                 let (id, time_ns) = (u32_at(body, 0), u64_at(body, 4));
-                let mirror_hash = u64_at(body, 12);
+                let mirror_check = u32_at(body, 12);
                 let (snapshot, last) = (flags & 1 != 0, flags & 2 != 0);
                 let header = header.as_ref().expect("checked above");
-                if !last && mirror_hash != 0 {
+                if !last && mirror_check != 0 {
                     return Err("5.5: a hash before the last packet".into());
                 }
                 match open {
@@ -185,14 +181,15 @@ fn read_stream(bytes: &[u8], room: Room, kept: &mut Kept, out: &mut Read) -> Res
                     continue; // 5.6: withheld
                 }
                 if kind == 2 {
-                    apply(&body[20..], header, &slices, &mut mirror)?;
+                    apply(&body[16..], header, &slices, &mut mirror)?;
                 } else {
-                    apply_items(&body[20..], header, &kept.patches, &mut mirror, &mut slices)?;
+                    apply_items(&body[16..], header, &kept.patches, &mut mirror, &mut slices)?;
                 }
                 if !last {
                     continue;
                 }
-                if hash(&mirror) == mirror_hash {
+                let mirror_hash = hash(&mirror);
+                if (mirror_hash >> 32) as u32 == mirror_check {
                     live = true;
                     out.shown.push(Shown {
                         id,

@@ -4,7 +4,7 @@
 //! Waits end with what they wait for; their limits are only there to fail instead of hanging.
 
 use psao::core::mirror::Capacity;
-use psao::core::stream::{self, Refusal, write_packet};
+use psao::core::stream::{self, PACKET_HEADER_BYTES, Refusal, write_packet};
 use psao::core::uplink::{self, Camera, Hello, Transform};
 use psao::quic::{ALPN, Closed, Connect, ConnectError, Connection, Fingerprint, Trust, Unsent};
 use psao::{Client, ClientError, Config};
@@ -258,7 +258,7 @@ impl Raw {
 
 fn packet(
     kind: u8,
-    sequence: u32,
+    sequence: u16,
     body: impl FnOnce(&mut stream::Writer<'_>) -> Result<(), stream::StreamError>,
 ) -> Vec<u8> {
     let mut bytes = vec![0; 1 << 10];
@@ -364,8 +364,8 @@ fn a_client_is_refused_in_the_stream_with_the_reason() {
 fn a_hello_that_is_none_is_refused_and_the_server_goes_on() {
     let mut server = Server::start(1);
     let mut other_version = hello();
-    other_version[16] = 2;
-    let other_version = packet(uplink::kind::HELLO, 0, |w| w.bytes(&other_version[16..]));
+    other_version[PACKET_HEADER_BYTES] = 2;
+    let other_version = packet(uplink::kind::HELLO, 0, |w| w.bytes(&other_version[PACKET_HEADER_BYTES..]));
     let mut changed = hello();
     *changed.last_mut().unwrap() ^= 1;
     let long = packet(uplink::kind::HELLO, 0, |w| w.bytes(&[0; 600]));
@@ -380,11 +380,11 @@ fn a_hello_that_is_none_is_refused_and_the_server_goes_on() {
         (changed, Refusal::Malformed),
         (long, Refusal::Malformed),
         (
-            packet(uplink::kind::HELLO, 1, |w| w.bytes(&hello()[16..])),
+            packet(uplink::kind::HELLO, 1, |w| w.bytes(&hello()[PACKET_HEADER_BYTES..])),
             Refusal::Malformed,
         ),
         (
-            packet(uplink::kind::HELLO, 0, |w| w.bytes(&hello()[16..30])),
+            packet(uplink::kind::HELLO, 0, |w| w.bytes(&hello()[PACKET_HEADER_BYTES..][..14])),
             Refusal::Malformed,
         ),
         (
@@ -415,7 +415,7 @@ fn a_bad_message_ends_its_client_only() {
     nan.world_from_local[1][2] = f64::NAN;
     let on_the_stream = [
         vec![0xff; 100],
-        packet(uplink::kind::HELLO, 1, |w| w.bytes(&hello()[16..])),
+        packet(uplink::kind::HELLO, 1, |w| w.bytes(&hello()[PACKET_HEADER_BYTES..])),
         packet(uplink::kind::TRANSFORM, 1, |w| nan.write(w)),
         packet(uplink::kind::RESYNC, 2, |_| Ok(())),
         packet(77, 1, |_| Ok(())),
@@ -665,7 +665,7 @@ fn cameras_go_over_the_stream_where_the_server_takes_no_datagrams() {
     let served = runtime.spawn(async move {
         let connection = endpoint.accept().await.unwrap().await.unwrap();
         let (_send, mut receive) = connection.accept_bi().await.unwrap();
-        let mut bytes = vec![0; hello().len() + 2 * 16 + 60 + 4];
+        let mut bytes = vec![0; hello().len() + 2 * PACKET_HEADER_BYTES + 60 + 4];
         receive.read_exact(&mut bytes).await.unwrap();
         bytes
     });
@@ -759,12 +759,12 @@ fn a_camera_or_ack_that_was_overtaken_is_dropped() {
     let mut raw = Raw::open(&server);
     raw.say(&hello());
     let id = server.joined();
-    let at = |sequence: u32, x| packet(uplink::kind::CAMERA, sequence, |w| camera(x).write(w));
-    let ack = |sequence: u32, frame: u32| packet(uplink::kind::ACK, sequence, |w| w.u32(frame));
+    let at = |sequence: u16, x| packet(uplink::kind::CAMERA, sequence, |w| camera(x).write(w));
+    let ack = |sequence: u16, frame: u32| packet(uplink::kind::ACK, sequence, |w| w.u32(frame));
     // Sequences wrap; each kind is compared with its own.
-    raw.datagram(at(u32::MAX - 1, 1.0));
+    raw.datagram(at(u16::MAX - 1, 1.0));
     raw.datagram(at(2, 2.0));
-    raw.datagram(at(u32::MAX, 3.0));
+    raw.datagram(at(u16::MAX, 3.0));
     raw.datagram(at(2, 4.0));
     raw.datagram(ack(1, 10));
     // Datagrams of the loopback interface keep their order: the last one comes behind them all.

@@ -464,7 +464,7 @@ impl Player {
                 ),
             ),
             row(
-                "mirror hash",
+                "mirror",
                 format!("{:016x}", self.client.mirror().hash()),
             ),
             row("hash mismatches", stats.mismatches.to_string()),
@@ -519,7 +519,7 @@ pub fn inspect(args: &InspectArgs, out: &mut dyn Write) -> Result<(), String> {
                 print(out, format!("{header:#?}"))?;
                 print(
                     out,
-                    "frame      time s  packets     bytes  mirror hash".into(),
+                    "frame      time s  packets     bytes  mirror".into(),
                 )?;
             }
             kind::FRAME | kind::SLICES => {
@@ -530,11 +530,11 @@ pub fn inspect(args: &InspectArgs, out: &mut dyn Write) -> Result<(), String> {
                     let Frame {
                         id,
                         time_ns,
-                        mirror_hash,
+                        mirror_check,
                     } = frame;
                     let seconds = time_ns as f64 / 1e9;
                     let line = format!(
-                        "{id:>5}  {seconds:>10.4}  {packets:>7}  {frame_bytes:>8}  {mirror_hash:016x}"
+                        "{id:>5}  {seconds:>10.4}  {packets:>7}  {frame_bytes:>8}  {mirror_check:08x}"
                     );
                     print(out, line)?;
                     (packets, frame_bytes) = (0, 0);

@@ -21,7 +21,7 @@ use psao_core::mirror::Capacity;
 use psao_core::residual::Quantiser;
 use psao_core::stream::{
     self, FRAME_HEADER_BYTES, Frame, Header, PACKET_HEADER_BYTES, PREAMBLE, Profile,
-    RAW_LENGTH_BYTES, StreamError, Writer, flag, kind, write_packet,
+    RAW_LENGTH_BYTES, StreamError, Writer, flag, kind, mirror_check, write_packet,
 };
 use psao_core::{Bucket, Cell, Instance, Mirror};
 use rayon::prelude::*;
@@ -144,7 +144,7 @@ pub struct Encoder {
     scheme: Scheme,
     sent: Sent,
     frame_id: u32,
-    sequence: u32,
+    sequence: u16,
     snapshot: bool,
 }
 
@@ -312,7 +312,7 @@ impl Encoder {
             let mut frame = Frame {
                 id: self.frame_id,
                 time_ns,
-                mirror_hash: 0,
+                mirror_check: 0,
             };
             if self.snapshot {
                 flags |= flag::SNAPSHOT;
@@ -320,7 +320,7 @@ impl Encoder {
             }
             if index + 1 == packets.len() {
                 flags |= flag::LAST;
-                frame.mirror_hash = self.mirror().hash();
+                frame.mirror_check = mirror_check(self.mirror().hash());
             }
             self.packet(out, *kind, flags, FRAME_HEADER_BYTES + body.len(), |w| {
                 frame.write(w)?;

@@ -589,7 +589,7 @@ fn close(connection: &quinn::Connection, shared: &Shared, id: ClientId, end: End
 #[derive(Default)]
 struct Packets {
     bytes: Vec<u8>,
-    next_sequence: u32,
+    next_sequence: u16,
 }
 
 impl Packets {
@@ -674,8 +674,8 @@ async fn read_messages(
 async fn read_datagrams(connection: quinn::Connection, shared: Arc<Shared>, id: ClientId) {
     let (mut last_camera, mut last_ack) = (None, None);
     // Sequences wrap.
-    let newer = |sequence: u32, last: &mut Option<u32>| {
-        let newer = last.is_none_or(|last| sequence.wrapping_sub(last) as i32 > 0);
+    let newer = |sequence: u16, last: &mut Option<u16>| {
+        let newer = last.is_none_or(|last| sequence.wrapping_sub(last) as i16 > 0);
         if newer {
             *last = Some(sequence);
         }
@@ -683,7 +683,7 @@ async fn read_datagrams(connection: quinn::Connection, shared: Arc<Shared>, id: 
     };
     // Where the connection ends, the stream's reader says why.
     while let Ok(datagram) = connection.read_datagram().await {
-        let read = || -> Result<(u32, Option<Message<'_>>), StreamError> {
+        let read = || -> Result<(u16, Option<Message<'_>>), StreamError> {
             let (packet, length) =
                 Packet::read(&datagram, MAX_BODY_BYTES)?.ok_or(StreamError::Length)?;
             if length != datagram.len() {

@@ -417,7 +417,7 @@ static void check_capacity(bytes stream) {
 }
 
 static uint32_t sequence_of(const uint8_t *message) {
-    return message[8] | (uint32_t)message[9] << 8;
+    return message[2] | (uint32_t)message[3] << 8;
 }
 
 static void check_uplink(bytes stream) {
@@ -431,7 +431,7 @@ static void check_uplink(bytes stream) {
 
     GIVES(PSAO_ERROR_VALUE, psao_uplink_hello(&uplink, &config, token, 257, 0, out, room, &length));
     GIVES(PSAO_ERROR_OUTPUT_SIZE,
-          psao_uplink_hello(&uplink, &config, token, 5, 0, out, 16, &length));
+          psao_uplink_hello(&uplink, &config, token, 5, 0, out, 12, &length));
     CHECK(uplink.next_sequence == 0xffffffff && length == 0);
     GIVES(PSAO_OK, psao_uplink_hello(&uplink, &config, token, 256, 0, out, room, &length));
     CHECK(uplink.next_sequence == 1 && length > 256 && out[0] == 64 && sequence_of(out) == 0);
@@ -446,26 +446,26 @@ static void check_uplink(bytes stream) {
 
     double matrix[12] = {1, 0, 0, 5, 0, 1, 0, 6, 0, 0, 1, 7};
     GIVES(PSAO_OK, psao_uplink_transform(&uplink, 3, matrix, out, room, &length));
-    CHECK(out[0] == 66 && length == 116);
+    CHECK(out[0] == 66 && length == 112);
     matrix[4] = (double)(0.0f / (float)(uplink.next_sequence - 3));
     GIVES(PSAO_ERROR_VALUE, psao_uplink_transform(&uplink, 3, matrix, out, room, &length));
 
     float joints[24] = {0};
     GIVES(PSAO_OK, psao_uplink_joints(&uplink, 3, joints, 2, out, room, &length));
-    CHECK(out[0] == 67 && length == 24 + 96);
+    CHECK(out[0] == 67 && length == 20 + 96);
     GIVES(PSAO_OK, psao_uplink_joints(&uplink, 3, NULL, 0, out, room, &length));
     GIVES(PSAO_ERROR_NULL, psao_uplink_joints(&uplink, 3, NULL, 1, out, room, &length));
     GIVES(PSAO_ERROR_VALUE, psao_uplink_joints(&uplink, 3, joints, 4097, out, room, &length));
     GIVES(PSAO_OK, psao_uplink_ack(&uplink, 9, out, room, &length));
-    CHECK(out[0] == 68 && length == 20 && sequence_of(out) == 5);
-    GIVES(PSAO_OK, psao_uplink_resync(&uplink, out, 16, &length));
-    CHECK(out[0] == 69 && length == 16);
+    CHECK(out[0] == 68 && length == 16 && sequence_of(out) == 5);
+    GIVES(PSAO_OK, psao_uplink_resync(&uplink, out, 12, &length));
+    CHECK(out[0] == 69 && length == 12);
     GIVES(PSAO_ERROR_VALUE, psao_uplink_presence(&uplink, 3, 2, out, room, &length));
     GIVES(PSAO_OK, psao_uplink_presence(&uplink, 3, 1, out, room, &length));
-    CHECK(out[0] == 70 && length == 24 && out[16] == 3 && out[20] == 1 && out[21] == 0);
+    CHECK(out[0] == 70 && length == 20 && out[12] == 3 && out[16] == 1 && out[17] == 0);
     GIVES(PSAO_OK, psao_uplink_presence(&uplink, 3, 0, out, room, &length));
-    CHECK(out[20] == 0);
-    GIVES(PSAO_ERROR_OUTPUT_SIZE, psao_uplink_resync(&uplink, out, 15, &length));
+    CHECK(out[16] == 0);
+    GIVES(PSAO_ERROR_OUTPUT_SIZE, psao_uplink_resync(&uplink, out, 11, &length));
     GIVES(PSAO_ERROR_NULL, psao_uplink_resync(NULL, out, room, &length));
     GIVES(PSAO_ERROR_NULL, psao_uplink_resync(&uplink, NULL, room, &length));
     GIVES(PSAO_ERROR_NULL, psao_uplink_resync(&uplink, out, room, NULL));

@@ -5,7 +5,7 @@ use super::Files;
 use psao::core::mirror::Capacity;
 use psao::core::stream::{
     FRAME_HEADER_BYTES, Frame, Header, PACKET_HEADER_BYTES, PREAMBLE, Packet, Profile, Reader,
-    Refusal, Writer, flag, kind, write_packet,
+    Refusal, Writer, flag, kind, mirror_check, write_packet,
 };
 use psao::core::{Instance, Lookup};
 use psao::{Client, Config};
@@ -71,10 +71,10 @@ impl Parts {
         let goes_on = before.1 & flag::LAST == 0;
         let frame = Frame {
             id: frame.id + u32::from(!goes_on),
-            mirror_hash: if flags & flag::LAST == 0 {
+            mirror_check: if flags & flag::LAST == 0 {
                 0
             } else {
-                frame.mirror_hash
+                frame.mirror_check
             },
             ..frame
         };
@@ -92,8 +92,8 @@ impl Parts {
             while !rest.is_empty() {
                 rest = &rest[client.push(rest).unwrap().consumed..];
             }
-            let hash = client.mirror().recompute_hash();
-            parts.0[last].2[12..20].copy_from_slice(&hash.to_le_bytes());
+            let check = mirror_check(client.mirror().recompute_hash());
+            parts.0[last].2[12..16].copy_from_slice(&check.to_le_bytes());
         }
         parts
     }
@@ -194,7 +194,7 @@ fn by_hand(contents: &[Vec<u8>]) -> Parts {
         let frame = Frame {
             id: number,
             time_ns: 0,
-            mirror_hash: 0,
+            mirror_check: 0,
         };
         let flags = flag::LAST | if number == 1 { flag::SNAPSHOT } else { 0 };
         parts.push((kind::FRAME, flags, body(&frame, &packed(raw))));
@@ -490,9 +490,9 @@ fn broken_packets(parts: &Parts) -> Vec<Invalid> {
             let mut second = list[first].clone();
             second.1 = flag::LAST;
             second.2.truncate(FRAME_HEADER_BYTES);
-            second.2[20..].fill(0);
+            second.2[16..].fill(0);
             list[first].1 &= !flag::LAST;
-            list[first].2[12..20].fill(0);
+            list[first].2[12..16].fill(0);
             change(&mut second);
             list.insert(first + 1, second);
         })
@@ -510,11 +510,11 @@ fn broken_packets(parts: &Parts) -> Vec<Invalid> {
             "checksum-changed",
             "2.8",
             DAMAGED,
-            raw(&|bytes| bytes[header_at + 12] ^= 1),
+            raw(&|bytes| bytes[header_at + 8] ^= 1),
         ),
         (
-            "reserved-and-damaged",
-            "2.3,2.10",
+            "sequence-and-damaged",
+            "2.7,2.10",
             DAMAGED,
             raw(&|bytes| bytes[header_at + 2] = 1),
         ),
@@ -602,7 +602,7 @@ fn broken_packets(parts: &Parts) -> Vec<Invalid> {
             FORMAT,
             parts.changed(|list| {
                 list[last].1 &= !flag::LAST;
-                list[last].2[12..20].fill(0);
+                list[last].2[12..16].fill(0);
                 list.drain(last + 1..list.len() - 1);
             }),
         ),

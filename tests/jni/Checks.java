@@ -729,14 +729,14 @@ public final class Checks {
         uplink.presence(5, false, out);
         uplink.ack(6, out);
         uplink.resync(out);
-        // docs/format.md, 2.3: the body's length and the sequence.
+        // docs/format.md, 2.3: the sequence and the body's length.
         ByteBuffer bytes = out.bytes();
         int length = bytes.position();
         int at = 0;
         int sequence = 0;
         while (at < length) {
-            equal(sequence, bytes.getInt(at + 8));
-            at += 16 + bytes.getInt(at + 4);
+            equal(sequence, (int) bytes.getShort(at + 2));
+            at += 12 + bytes.getInt(at + 4);
             sequence++;
         }
         equal(length, at);
@@ -744,7 +744,7 @@ public final class Checks {
         // A hello begins to count anew.
         bytes.clear();
         uplink.hello(config, "", 0, out);
-        equal(0, bytes.getInt(8));
+        equal(0, (int) bytes.getShort(2));
     }
 
     void player() throws Exception {

@@ -63,7 +63,7 @@ int main(int count, char **words) {
     TIME("status", PSAO_OK, psao_client_status(client, i, &status));
     TIME("stats", PSAO_OK, psao_client_stats(client, &stats));
     TIME("camera", PSAO_OK, psao_uplink_camera(&uplink, &camera, out, sizeof out, &length));
-    CHECK(stats.frame_id == 10 && status.state == PSAO_STATE_ENDED && length > 16);
+    CHECK(stats.frame_id == 10 && status.state == PSAO_STATE_ENDED && length > 12);
     free(made.block);
     free(stream.data);
     return 0;

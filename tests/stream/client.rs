@@ -230,7 +230,7 @@ fn a_new_connection_keeps_the_old_picture_until_its_snapshot() {
     assert_eq!(client.state(), State::Desynchronised);
     // A frame that is no snapshot does not touch it: here the second before the first.
     let mut bytes = sample.bytes[places[2].clone()].to_vec();
-    bytes[8..12].copy_from_slice(&1u32.to_le_bytes());
+    bytes[2..4].copy_from_slice(&1u16.to_le_bytes());
     let mut whole = [&PREAMBLE[..], &bytes].concat();
     mend(&mut whole);
     assert_eq!(client.push(&whole[8..]).unwrap().frame, None);

@@ -12,7 +12,7 @@ use psao::core::slices::{
 };
 use psao::core::stream::{
     self, FRAME_HEADER_BYTES, Frame, Header, MAX_BODY_BYTES, PACKET_HEADER_BYTES, PREAMBLE, Packet,
-    Profile, Writer, flag, kind, write_packet,
+    Profile, Writer, flag, kind, mirror_check, write_packet,
 };
 use psao::core::topology::{
     MAX_PATCH_BYTES, Order, PATCH_POINTS, PatchPoint, decode_patch, encode_patch,
@@ -202,7 +202,7 @@ pub static SERVED_RESIDUAL: LazyLock<Sample> = LazyLock::new(|| serve(24.0, RESI
 #[derive(Clone)]
 pub struct Hand {
     pub bytes: Vec<u8>,
-    pub sequence: u32,
+    pub sequence: u16,
 }
 
 impl Hand {
@@ -273,7 +273,7 @@ impl Hand {
         let frame = Frame {
             id,
             time_ns: u64::from(id) * 1000,
-            mirror_hash: hash,
+            mirror_check: mirror_check(hash),
         };
         let mut body = vec![0; FRAME_HEADER_BYTES];
         frame.write(&mut Writer::new(&mut body)).unwrap();
@@ -786,11 +786,10 @@ pub fn read(
                     rest = &rest[pushed.consumed..];
                     if let Some(frame) = pushed.frame {
                         assert_eq!(client.state(), State::Live);
-                        assert_eq!(client.mirror().recompute_hash(), frame.mirror_hash);
+                        let hash = client.mirror().recompute_hash();
+                        assert_eq!(mirror_check(hash), frame.mirror_check);
                         check(client, &frame);
-                        outcome
-                            .shown
-                            .push((frame.id, frame.time_ns, frame.mirror_hash));
+                        outcome.shown.push((frame.id, frame.time_ns, hash));
                     }
                 }
                 Err(error) => {
@@ -840,7 +839,8 @@ impl Readers {
         let mut outcome = read(&mut self.client, bytes, usize::MAX, |client, frame| {
             let other = frames.next().expect("the second reader withholds this one");
             let said = (other.id, other.time_ns, other.mirror_hash);
-            assert_eq!(said, (frame.id, frame.time_ns, frame.mirror_hash));
+            let hash = client.mirror().hash();
+            assert_eq!(said, (frame.id, frame.time_ns, hash));
             let [instances, buckets, cells] = contents(client.mirror());
             for (bytes, buffer, size) in [
                 (instances, &other.mirror[0], 64),
@@ -919,9 +919,9 @@ pub fn mend(bytes: &mut [u8]) {
         if end > bytes.len() {
             return;
         }
-        let covered = [&bytes[at..at + 12], &bytes[at + 16..end]].concat();
+        let covered = [&bytes[at..at + 8], &bytes[at + 12..end]].concat();
         let checksum = second_reader::crc32(&covered);
-        bytes[at + 12..at + 16].copy_from_slice(&checksum.to_le_bytes());
+        bytes[at + 8..at + 12].copy_from_slice(&checksum.to_le_bytes());
         at = end;
     }
 }

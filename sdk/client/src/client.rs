@@ -7,7 +7,7 @@ use psao_core::slices::{apply_instances, apply_patches, apply_slices};
 use psao_core::stream::{
     CHANGES_HEADER_BYTES, FRAME_HEADER_BYTES, Frame, Header, MAX_BODY_BYTES, PACKET_HEADER_BYTES,
     PREAMBLE, Packet, Profile, RAW_LENGTH_BYTES, Reader, Refusal, StreamError, apply_changes, flag,
-    kind,
+    kind, mirror_check,
 };
 
 /// What a client may use at most.
@@ -197,7 +197,7 @@ struct Decoder {
     /// Decompressed content of a packet.
     raw: Piece<u8>,
     zstd: Piece<u64>,
-    next_sequence: u32,
+    next_sequence: u16,
     /// Number of the last frame that a packet came of.
     last_frame: Option<u32>,
     /// Number and time of the frame that is not complete.
@@ -543,7 +543,7 @@ impl Decoder {
         let (frame, content) = Frame::read(packet.body)?;
         let has = |flag: u8| packet.flags & flag != 0;
         let (snapshot, last) = (has(flag::SNAPSHOT), has(flag::LAST));
-        if !last && frame.mirror_hash != 0 {
+        if !last && frame.mirror_check != 0 {
             return Err(StreamError::Value.into());
         }
         let in_order = match self.open_frame {
@@ -594,7 +594,7 @@ impl Decoder {
         if !last {
             return Ok(None);
         }
-        if self.mirror.hash() != frame.mirror_hash {
+        if mirror_check(self.mirror.hash()) != frame.mirror_check {
             self.stats.mismatches += 1;
             self.state = State::Desynchronised;
             self.in_snapshot = false;

@@ -26,7 +26,7 @@ use rustls::pki_types::pem::PemObject;
 use rustls::pki_types::{CertificateDer, ServerName, UnixTime};
 use rustls::{DigitallySignedStruct, RootCertStore, SignatureScheme};
 use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr, ToSocketAddrs};
-use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::atomic::{AtomicU16, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError, mpsc};
 use std::time::{Duration, Instant};
 use tokio::runtime;
@@ -329,7 +329,7 @@ impl Received {
 struct Uplink {
     /// Whole packets.
     bytes: Vec<u8>,
-    next_sequence: u32,
+    next_sequence: u16,
 }
 
 /// Locks. Nothing panics while it holds one of these locks, so what they guard is whole.
@@ -342,7 +342,7 @@ pub struct Connection {
     quic: quinn::Connection,
     shared: Arc<Shared>,
     /// Datagrams are counted by themselves: they may overtake each other and the stream.
-    next_datagram: AtomicU32,
+    next_datagram: AtomicU16,
     thread: Option<std::thread::JoinHandle<()>>,
 }
 
@@ -382,7 +382,7 @@ impl Connection {
             Ok(quic) => Ok(Connection {
                 quic,
                 shared,
-                next_datagram: AtomicU32::new(0),
+                next_datagram: AtomicU16::new(0),
                 thread: Some(thread),
             }),
             Err(error) => {
@@ -534,7 +534,7 @@ impl Drop for Connection {
 fn encode(
     out: &mut [u8],
     kind: u8,
-    sequence: u32,
+    sequence: u16,
     body: impl FnOnce(&mut Writer<'_>) -> Result<(), StreamError>,
 ) -> Result<usize, StreamError> {
     let length = write_packet(out, kind, 0, sequence, body)?;

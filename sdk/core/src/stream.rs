@@ -26,7 +26,10 @@ pub const VERSION_MAJOR: u16 = 1;
 pub const VERSION_MINOR: u16 = 0;
 
 /// Bytes of a packet's header.
-pub const PACKET_HEADER_BYTES: usize = 16;
+pub const PACKET_HEADER_BYTES: usize = 12;
+
+/// Where its checksum is, which covers what is before it, and the body.
+const CHECKSUM_AT: usize = PACKET_HEADER_BYTES - 4;
 
 /// Largest body any packet may have.
 pub const MAX_BODY_BYTES: u32 = 1 << 22;
@@ -35,7 +38,7 @@ pub const MAX_BODY_BYTES: u32 = 1 << 22;
 pub const MAX_RAW_BYTES: u32 = 1 << 22;
 
 /// Bytes of a frame's or a slices packet's body before its content.
-pub const FRAME_HEADER_BYTES: usize = 20;
+pub const FRAME_HEADER_BYTES: usize = 16;
 
 /// Bytes of a frame packet's content before what is compressed: the length that this will have.
 pub const RAW_LENGTH_BYTES: usize = 4;
@@ -61,7 +64,7 @@ pub mod kind {
 pub mod flag {
     /// Frame: the mirror is reset before this packet is applied.
     pub const SNAPSHOT: u8 = 1;
-    /// Frame: the frame is complete with this packet, and `mirror_hash` holds.
+    /// Frame: the frame is complete with this packet, and `mirror_check` holds.
     pub const LAST: u8 = 2;
     /// Any unknown kind: may be skipped by a reader that does not know it.
     pub const OPTIONAL: u8 = 128;
@@ -181,8 +184,14 @@ pub struct Frame {
     pub id: u32,
     /// Scene time of this state, nanoseconds since the scene's start.
     pub time_ns: u64,
-    /// [`Mirror::hash`] after the frame; 0 in all but its last packet.
-    pub mirror_hash: u64,
+    /// [`mirror_check`] of [`Mirror::hash`] after the frame; 0 in all but its last packet.
+    pub mirror_check: u32,
+}
+
+/// What a frame says of its mirror's hash: the upper half, as in the lower one a bit depends on none
+/// above it.
+pub fn mirror_check(hash: u64) -> u32 {
+    (hash >> 32) as u32
 }
 
 /// Why a server will not serve a client.
@@ -234,7 +243,7 @@ pub struct Packet<'a> {
     /// See [`flag`].
     pub flags: u8,
     /// Counts up by 1 a packet, wrapping.
-    pub sequence: u32,
+    pub sequence: u16,
     /// Content.
     pub body: &'a [u8],
 }
@@ -259,20 +268,17 @@ impl<'a> Packet<'a> {
             return Ok(None);
         };
         let mut reader = Reader(header);
-        let (kind, flags, reserved) = (reader.u8()?, reader.u8()?, reader.u16()?);
-        let (body_bytes, sequence, checksum) = (reader.u32()?, reader.u32()?, reader.u32()?);
+        let (kind, flags, sequence) = (reader.u8()?, reader.u8()?, reader.u16()?);
+        let (body_bytes, checksum) = (reader.u32()?, reader.u32()?);
         if body_bytes > max_body_bytes.min(MAX_BODY_BYTES) {
             return Err(StreamError::PacketTooLarge(body_bytes));
         }
         let Some(body) = rest.get(..body_bytes as usize) else {
             return Ok(None);
         };
-        let (covered, _) = header.split_at(12);
+        let (covered, _) = header.split_at(CHECKSUM_AT);
         if crc32(covered, body) != checksum {
             return Err(StreamError::Checksum);
-        }
-        if reserved != 0 {
-            return Err(StreamError::Value);
         }
         let length = PACKET_HEADER_BYTES.saturating_add(body_bytes as usize);
         Ok(Some((
@@ -302,7 +308,7 @@ pub fn write_packet(
     out: &mut [u8],
     kind: u8,
     flags: u8,
-    sequence: u32,
+    sequence: u16,
     body: impl FnOnce(&mut Writer<'_>) -> Result<(), StreamError>,
 ) -> Result<usize, StreamError> {
     let (header, rest) = out
@@ -318,14 +324,14 @@ pub fn write_packet(
         return Err(StreamError::PacketTooLarge(body_bytes as u32));
     }
     let body = rest.get(..body_bytes).ok_or(StreamError::Length)?;
-    let (covered, checksum) = header.split_at_mut(12);
+    let (covered, checksum) = header.split_at_mut(CHECKSUM_AT);
     let mut writer = Writer {
         out: covered,
         length: 0,
     };
-    writer.bytes(&[kind, flags, 0, 0])?;
+    writer.bytes(&[kind, flags])?;
+    writer.u16(sequence)?;
     writer.u32(body_bytes as u32)?;
-    writer.u32(sequence)?;
     checksum.copy_from_slice(&crc32(covered, body).to_le_bytes());
     Ok(PACKET_HEADER_BYTES.saturating_add(body_bytes))
 }
@@ -448,7 +454,7 @@ impl Frame {
         let frame = Frame {
             id: r.u32()?,
             time_ns: r.u64()?,
-            mirror_hash: r.u64()?,
+            mirror_check: r.u32()?,
         };
         Ok((frame, r.0))
     }
@@ -457,7 +463,7 @@ impl Frame {
     pub fn write(&self, w: &mut Writer<'_>) -> Result<(), StreamError> {
         w.u32(self.id)?;
         w.u64(self.time_ns)?;
-        w.u64(self.mirror_hash)
+        w.u32(self.mirror_check)
     }
 }
 

@@ -50,6 +50,8 @@ pub struct psao_client {
 struct Pusher {
     client: Client,
     frame: Frame,
+    /// Of the mirror at that frame.
+    mirror_hash: u64,
     /// The newest complete frame was not handed over.
     waiting: bool,
     merged: u64,
@@ -248,7 +250,7 @@ impl psao_config {
 /// Check the memory that it asks for against your own limit: a hostile server may ask for a lot.
 ///
 /// Returns PSAO_NEED_MORE, and writes nothing, until the bytes hold the first packet (the first
-/// 4120 bytes always do).
+/// 4116 bytes always do).
 ///
 /// Threads: any. No alloc, lock or log. Safe on untrusted input. Since ABI 1.
 ///
@@ -375,6 +377,7 @@ pub unsafe extern "C" fn psao_client_init(
             pusher: UnsafeCell::new(Pusher {
                 client,
                 frame: Frame::default(),
+                mirror_hash: 0,
                 waiting: false,
                 merged: 0,
                 fastest_ns: None,
@@ -484,6 +487,7 @@ impl psao_client {
         if let Some(frame) = pushed.frame {
             pusher.merged += u64::from(pusher.waiting);
             pusher.frame = frame;
+            pusher.mirror_hash = pusher.client.mirror().hash();
             pusher.waiting = true;
             let late = i128::from(now_ns) - i128::from(frame.time_ns);
             let fastest = pusher.fastest_ns.map_or(late, |fastest| fastest.min(late));
@@ -755,7 +759,7 @@ pub unsafe extern "C" fn psao_client_stats(
                 frame_id: pusher.frame.id,
                 server_time_ns: pusher.frame.time_ns,
                 delay_ns: pusher.delay_ns,
-                mirror_hash: pusher.frame.mirror_hash,
+                mirror_hash: pusher.mirror_hash,
                 stream_bytes: stats.bytes,
                 frame_count: stats.frames,
                 snapshot_count: stats.snapshots,

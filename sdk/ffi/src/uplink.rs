@@ -9,7 +9,7 @@ use psao::core::uplink::{
 };
 
 /// The longest message that psao_uplink_joints writes, with 4096 joints.
-pub const PSAO_UPLINK_MAX_BYTES: u32 = 196632;
+pub const PSAO_UPLINK_MAX_BYTES: u32 = 196628;
 
 /// The longest message of any other psao_uplink_ function.
 pub const PSAO_UPLINK_SMALL_BYTES: u32 = 384;
@@ -36,7 +36,7 @@ unsafe fn message(
     unsafe {
         let sequence = (*uplink).next_sequence;
         let out = core::slice::from_raw_parts_mut(out, room);
-        let written = match write_packet(out, kind, 0, sequence, body) {
+        let written = match write_packet(out, kind, 0, sequence as u16, body) {
             Err(StreamError::Length) => return Err(PSAO_ERROR_OUTPUT_SIZE),
             written => written?,
         };
@@ -178,7 +178,7 @@ pub unsafe extern "C" fn psao_uplink_transform(
 /// local_from_rest: 12 floats a joint, three rows of four: what takes a vertex from rest space to
 /// local space. joint_count: the skin's, at most 4096.
 ///
-/// out: 24 bytes and 48 a joint, at most PSAO_UPLINK_MAX_BYTES.
+/// out: 20 bytes and 48 a joint, at most PSAO_UPLINK_MAX_BYTES.
 ///
 /// PSAO_ERROR_VALUE: a value is not finite, or there are too many joints.
 ///

@@ -50,7 +50,7 @@ public final class PsaoConfig {
      * <p>Threads: any. Makes garbage. Safe on untrusted input.
      *
      * @param first the stream's first bytes, from the buffer's position to its limit
-     * @return null until they hold the first packet; the first 4120 bytes always do
+     * @return null until they hold the first packet; the first 4116 bytes always do
      * @throws PsaoException {@link PsaoResult#ERROR_NOT_A_STREAM} and the others of a stream
      */
     public static PsaoConfig fromStream(PsaoBuffer first) {

@@ -11,7 +11,7 @@ import java.nio.charset.Charset;
  */
 public final class PsaoUplink {
     /** The longest message that {@link #joints} writes, with 4096 joints, in bytes. */
-    public static final int MAX_BYTES = 196632;
+    public static final int MAX_BYTES = 196628;
     /** The longest message of any other method, in bytes. */
     public static final int SMALL_BYTES = 384;
 
@@ -101,7 +101,7 @@ public final class PsaoUplink {
      * @param localFromRest 12 floats a joint from the buffer's first byte, three rows of four: what
      *     takes a vertex from rest space to local space
      * @param jointCount the skin's, at most 4096
-     * @param out room for 24 bytes and 48 a joint, at most {@link #MAX_BYTES}
+     * @param out room for 20 bytes and 48 a joint, at most {@link #MAX_BYTES}
      * @throws PsaoException {@link PsaoResult#ERROR_VALUE}: a number is not finite, the buffer's
      *     memory is not aligned to 4 bytes, or there are too many joints.
      *     {@link PsaoResult#ERROR_OUTPUT_SIZE}: out has too little room

@@ -16,7 +16,7 @@ import org.psao.PsaoPlayer;
  */
 public final class PsaoAssets {
     /** So many bytes of a stream always hold its first packet. */
-    private static final int FIRST_BYTES = 4120;
+    private static final int FIRST_BYTES = 4116;
 
     private PsaoAssets() {}
 
