@@ -365,7 +365,9 @@ fn a_hello_that_is_none_is_refused_and_the_server_goes_on() {
     let mut server = Server::start(1);
     let mut other_version = hello();
     other_version[PACKET_HEADER_BYTES] = 2;
-    let other_version = packet(uplink::kind::HELLO, 0, |w| w.bytes(&other_version[PACKET_HEADER_BYTES..]));
+    let other_version = packet(uplink::kind::HELLO, 0, |w| {
+        w.bytes(&other_version[PACKET_HEADER_BYTES..])
+    });
     let mut changed = hello();
     *changed.last_mut().unwrap() ^= 1;
     let long = packet(uplink::kind::HELLO, 0, |w| w.bytes(&[0; 600]));
@@ -380,11 +382,15 @@ fn a_hello_that_is_none_is_refused_and_the_server_goes_on() {
         (changed, Refusal::Malformed),
         (long, Refusal::Malformed),
         (
-            packet(uplink::kind::HELLO, 1, |w| w.bytes(&hello()[PACKET_HEADER_BYTES..])),
+            packet(uplink::kind::HELLO, 1, |w| {
+                w.bytes(&hello()[PACKET_HEADER_BYTES..])
+            }),
             Refusal::Malformed,
         ),
         (
-            packet(uplink::kind::HELLO, 0, |w| w.bytes(&hello()[PACKET_HEADER_BYTES..][..14])),
+            packet(uplink::kind::HELLO, 0, |w| {
+                w.bytes(&hello()[PACKET_HEADER_BYTES..][..14])
+            }),
             Refusal::Malformed,
         ),
         (
@@ -415,7 +421,9 @@ fn a_bad_message_ends_its_client_only() {
     nan.world_from_local[1][2] = f64::NAN;
     let on_the_stream = [
         vec![0xff; 100],
-        packet(uplink::kind::HELLO, 1, |w| w.bytes(&hello()[PACKET_HEADER_BYTES..])),
+        packet(uplink::kind::HELLO, 1, |w| {
+            w.bytes(&hello()[PACKET_HEADER_BYTES..])
+        }),
         packet(uplink::kind::TRANSFORM, 1, |w| nan.write(w)),
         packet(uplink::kind::RESYNC, 2, |_| Ok(())),
         packet(77, 1, |_| Ok(())),

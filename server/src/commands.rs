@@ -464,7 +464,7 @@ impl Player {
                 ),
             ),
             row(
-                "mirror",
+                "mirror hash",
                 format!("{:016x}", self.client.mirror().hash()),
             ),
             row("hash mismatches", stats.mismatches.to_string()),
@@ -517,10 +517,7 @@ pub fn inspect(args: &InspectArgs, out: &mut dyn Write) -> Result<(), String> {
             kind::HEADER => {
                 let header = Header::read(packet.body).map_err(|error| fail(&error))?;
                 print(out, format!("{header:#?}"))?;
-                print(
-                    out,
-                    "frame      time s  packets     bytes  mirror".into(),
-                )?;
+                print(out, "frame      time s  packets     bytes     check".into())?;
             }
             kind::FRAME | kind::SLICES => {
                 let (frame, _) = Frame::read(packet.body).map_err(|error| fail(&error))?;

@@ -341,7 +341,8 @@ fn a_recording_is_the_same_twice_and_plays_to_what_the_server_had() {
         assert_eq!(lines.next(), Some("end"));
         let last = lines.next().unwrap();
         assert!(last.trim_start().starts_with("5 "), "{last}");
-        assert!(last.ends_with(row(&played, "mirror hash")), "{last}");
+        let upper_half = &row(&played, "mirror hash")[..8];
+        assert!(last.ends_with(&format!("  {upper_half}")), "{last}");
         let played = works(folder, &["play", "a.psao", "--frames", "2"]);
         assert_eq!(row(&played, "frames"), "2 (1 snapshots)");
     }
