@@ -66,38 +66,111 @@ pub fn free_all(free: &mut [u64], cells: u32) {
     dirty::unmark(free, cells as usize, 0);
 }
 
-/// Stores a point in its cell; a new one if need be, the free one with the lowest index. Returns
-/// [`NOWHERE`] if the cell or its bucket is full, or no cell is free.
+/// Points that [`insert`] takes at a time.
+pub const GROUP: usize = 64;
+
+/// Points of a group that come one after another and fall into one cell.
+#[derive(Clone, Copy, Default)]
+struct Run {
+    bin_cell: [u32; 3],
+    key: u32,
+    home: u32,
+    /// The cell's index; 0 if there is none yet.
+    index: u32,
+}
+
+/// Stores those points of a group whose bit is set in `which`, in order, each in its cell; a new
+/// one if need be, the free one with the lowest index. A point's place stays [`NOWHERE`] if it is
+/// outside the grid, its cell or its bucket is full, or no cell is free.
+///
+/// What is longer than the shortest, or than [`GROUP`], is left alone.
 pub fn insert<M: Memory>(
     mirror: &mut Mirror<M>,
     free: &mut [u64],
     grid: &Instance,
-    bin: Bin,
-    point: Point,
-) -> Place {
-    let (key, home) = (grid.key(bin.cell), grid.bucket(bin.cell));
-    let Some(bucket) = mirror.buckets().get(home as usize).copied() else {
-        return NOWHERE;
-    };
-    let has_key = |index: &u32| {
-        let cell = mirror.cells().get(*index as usize);
-        cell.is_some_and(|cell| cell.key == key)
-    };
-    let index = match bucket.cells().find(has_key) {
-        Some(index) => index,
-        None => match allocate(mirror, free, home, bucket, key) {
-            Some(index) => index,
-            None => return NOWHERE,
-        },
-    };
-    let cell = mirror.cells().get(index as usize).copied();
-    let vacant = cell.and_then(|cell| cell.points.iter().position(|p| !p.is_allocated()));
-    let Some(vacant) = vacant else {
-        return NOWHERE;
-    };
-    let place = index << 3 | vacant as u32;
-    mirror.set_point(place, point);
-    place
+    which: u64,
+    points: &[PatchPoint],
+    values: &[u8],
+    places: &mut [Place],
+) {
+    let mut runs = [Run::default(); GROUP];
+    let mut packed = [(0u8, Point::EMPTY); GROUP];
+    let mut last = None;
+    let mut begun = 0usize;
+    let all = points.iter().zip(values).zip(&mut packed).enumerate();
+    for (at, ((point, value), (run_of, packed))) in all {
+        let Some(bin) = Bin::of(grid, point).filter(|_| which >> at & 1 != 0) else {
+            continue;
+        };
+        let key = grid.key(bin.cell);
+        if last != Some(key) {
+            last = Some(key);
+            if let Some(run) = runs.get_mut(begun) {
+                (run.bin_cell, run.key) = (bin.cell, key);
+            }
+            begun = begun.saturating_add(1);
+        }
+        *run_of = begun.wrapping_sub(1) as u8;
+        *packed = Point::pack(bin.position, point.normal, *value);
+    }
+    let runs = runs.get_mut(..begun).unwrap_or_default();
+    // Buckets and cells lie anywhere in a large memory. Loops that do nothing but read them, first
+    // the ones and then the others, and whose steps do not wait for each other, have many of them
+    // on their way at a time.
+    let mut buckets = [Bucket::default(); GROUP];
+    for (run, bucket) in runs.iter_mut().zip(&mut buckets) {
+        run.home = grid.bucket(run.bin_cell);
+        let stored = mirror.buckets().get(run.home as usize);
+        *bucket = stored.copied().unwrap_or_default();
+    }
+    for (run, bucket) in runs.iter_mut().zip(&buckets) {
+        run.index = find(mirror, bucket, run.key);
+    }
+    for ((run_of, point), place) in packed.into_iter().zip(places) {
+        let Some(run) = runs.get_mut(usize::from(run_of)) else {
+            continue;
+        };
+        if point == Point::EMPTY {
+            continue;
+        }
+        if run.index == 0 {
+            run.index = find_or_allocate(mirror, free, run.home, run.key).unwrap_or(0);
+        }
+        let cell = mirror.cells().get(run.index as usize);
+        let points = cell.map(|cell| cell.points).unwrap_or_default();
+        let taken = points.iter().rev().fold(0u32, |taken, point| {
+            taken << 1 | u32::from(point.is_allocated())
+        });
+        let vacant = taken.trailing_ones();
+        if run.index != 0 && vacant < CELL_POINTS as u32 {
+            *place = run.index << 3 | vacant;
+            mirror.set_point(*place, point);
+        }
+    }
+}
+
+/// The cell of a bucket that has a key, the first of several; 0 for none.
+fn find<M: Memory>(mirror: &Mirror<M>, bucket: &Bucket, key: u32) -> u32 {
+    let cells = mirror.cells();
+    // All are looked at: where to stop would be hard to foretell.
+    bucket.entries.iter().rev().fold(0, |found, &index| {
+        let has = cells.get(index as usize).map(|cell| cell.key) == Some(key);
+        if has && index != 0 { index } else { found }
+    })
+}
+
+/// A cell that came about since it was looked for, or else a new one.
+fn find_or_allocate<M: Memory>(
+    mirror: &mut Mirror<M>,
+    free: &mut [u64],
+    home: u32,
+    key: u32,
+) -> Option<u32> {
+    let bucket = mirror.buckets().get(home as usize).copied()?;
+    match find(mirror, &bucket, key) {
+        0 => allocate(mirror, free, home, bucket, key),
+        index => Some(index),
+    }
 }
 
 fn allocate<M: Memory>(
@@ -214,7 +287,24 @@ mod tests {
                 let position = [random(32), random(32), random(32)];
                 let bin = Bin { cell, position };
                 let point = Point::pack(position, random(225) as u8, random(256) as u8);
-                let place = insert(&mut mirror, &mut free, &grid, bin, point);
+                let at = [0, 1, 2].map(|axis| cell[axis] * 32 + position[axis]);
+                let patch_point = PatchPoint {
+                    position: at,
+                    normal: point.normal(),
+                    ..PatchPoint::default()
+                };
+                assert_eq!(Bin::of(&grid, &patch_point), Some(bin));
+                let mut place = [NOWHERE];
+                insert(
+                    &mut mirror,
+                    &mut free,
+                    &grid,
+                    1,
+                    &[patch_point],
+                    &[point.occlusion()],
+                    &mut place,
+                );
+                let [place] = place;
                 let here = held.iter().filter(|(other, ..)| other.cell == cell).count();
                 if place == NOWHERE {
                     full_cells += usize::from(here == CELL_POINTS);

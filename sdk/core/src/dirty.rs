@@ -21,6 +21,52 @@ pub fn mark(set: &mut [u64], len: usize, index: usize) {
     }
 }
 
+/// Marks indices of which many are near each other: those of a word are gathered before the set
+/// is touched.
+pub struct Marks<'a> {
+    set: &'a mut [u64],
+    len: usize,
+    word: usize,
+    bits: u64,
+}
+
+impl<'a> Marks<'a> {
+    /// Of a set over `len` indices.
+    pub fn new(set: &'a mut [u64], len: usize) -> Marks<'a> {
+        Marks {
+            set,
+            len,
+            word: 0,
+            bits: 0,
+        }
+    }
+
+    /// Adds `index` (ignored if not below `len`).
+    pub fn mark(&mut self, index: usize) {
+        if index < self.len {
+            if index / 64 != self.word {
+                self.put();
+                self.word = index / 64;
+            }
+            self.bits |= 1 << (index % 64);
+        }
+    }
+
+    fn put(&mut self) {
+        if self.bits != 0 {
+            self.set[self.word] |= self.bits;
+            self.set[self.len.div_ceil(64) + self.word / 64] |= 1 << (self.word % 64);
+            self.bits = 0;
+        }
+    }
+}
+
+impl Drop for Marks<'_> {
+    fn drop(&mut self) {
+        self.put();
+    }
+}
+
 /// Removes `index` (ignored if not below `len`).
 pub fn unmark(set: &mut [u64], len: usize, index: usize) {
     if index < len {

@@ -294,26 +294,35 @@ impl<M: Memory> Mirror<M> {
             .chunks(64)
             .zip(values.chunks(64))
             .zip(last.chunks(64));
+        let mut dirty = dirty::Marks::new(set, capacity.cells as usize);
         for ((places, values), last) in runs {
             // Which points changed is hard to foretell: a branch for each would cost more.
             let mut changed = not_zero(last);
+            let mut found = [(0u32, 0u8, Point::EMPTY); 64];
+            let mut count = 0;
+            // Cells are far apart in a large memory. A loop that does little but read them has many
+            // on their way at a time.
             while changed != 0 {
                 let which = changed.trailing_zeros() as usize;
                 changed &= changed - 1;
-                let (Some(place), Some(value)) = (places.get(which), values.get(which)) else {
+                let (Some(&place), Some(&value)) = (places.get(which), values.get(which)) else {
                     break;
                 };
-                let (index, at) = (place >> 3, place & 7);
                 // NOWHERE's place in a cell is one that no cell has.
-                let cell = parts.cells.get_mut(index as usize);
-                if let Some(point) = cell.and_then(|cell| cell.points.get_mut(at as usize)) {
-                    // Occlusion is a word's lowest byte; word 0 is the key.
-                    let change = u64::from(*value).wrapping_sub(u64::from(point.occlusion()));
-                    let factor = word_factor(3, index, at + 1);
-                    self.hash = self.hash.wrapping_add(factor.wrapping_mul(change));
-                    *point = point.with_occlusion(*value);
-                    dirty::mark(set, capacity.cells as usize, index as usize);
+                let cell = parts.cells.get((place >> 3) as usize);
+                if let Some(point) = cell.and_then(|cell| cell.points.get((place & 7) as usize)) {
+                    found[count] = (place, value, *point);
+                    count += 1;
                 }
+            }
+            for (place, value, point) in &found[..count] {
+                let (index, at) = (place >> 3, place & 7);
+                // Occlusion is a word's lowest byte; word 0 is the key.
+                let change = u64::from(*value).wrapping_sub(u64::from(point.occlusion()));
+                let factor = word_factor(3, index, at + 1);
+                self.hash = self.hash.wrapping_add(factor.wrapping_mul(change));
+                parts.cells[index as usize].points[at as usize] = point.with_occlusion(*value);
+                dirty.mark(index as usize);
             }
         }
     }
