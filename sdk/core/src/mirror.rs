@@ -298,7 +298,7 @@ impl<M: Memory> Mirror<M> {
         for ((places, values), last) in runs {
             // Which points changed is hard to foretell: a branch for each would cost more.
             let mut changed = not_zero(last);
-            let mut found = [(0u32, 0u8, Point::EMPTY); 64];
+            let mut found = [(0u32, Point::EMPTY, Point::EMPTY); 64];
             let mut count = 0;
             // Cells are far apart in a large memory. A loop that does little but read them has many
             // on their way at a time.
@@ -311,17 +311,17 @@ impl<M: Memory> Mirror<M> {
                 // NOWHERE's place in a cell is one that no cell has.
                 let cell = parts.cells.get((place >> 3) as usize);
                 if let Some(point) = cell.and_then(|cell| cell.points.get((place & 7) as usize)) {
-                    found[count] = (place, value, *point);
+                    found[count] = (place, *point, point.with_occlusion(value));
                     count += 1;
                 }
             }
-            for (place, value, point) in &found[..count] {
+            for (place, had, has) in &found[..count] {
                 let (index, at) = (place >> 3, place & 7);
-                // Occlusion is a word's lowest byte; word 0 is the key.
-                let change = u64::from(*value).wrapping_sub(u64::from(point.occlusion()));
+                let change = u64::from(has.0).wrapping_sub(u64::from(had.0));
+                // Word 0 is the key.
                 let factor = word_factor(3, index, at + 1);
                 self.hash = self.hash.wrapping_add(factor.wrapping_mul(change));
-                parts.cells[index as usize].points[at as usize] = point.with_occlusion(*value);
+                parts.cells[index as usize].points[at as usize] = *has;
                 dirty.mark(index as usize);
             }
         }
