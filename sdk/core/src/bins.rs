@@ -69,10 +69,10 @@ pub fn free_all(free: &mut [u64], cells: u32) {
 /// Points that [`insert`] takes at a time.
 pub const GROUP: usize = 64;
 
-/// Points of a group that come one after another and fall into one cell.
+/// A cell that points of a group fall into.
 #[derive(Clone, Copy, Default)]
-struct Run {
-    bin_cell: [u32; 3],
+struct Target {
+    cell: [u32; 3],
     key: u32,
     home: u32,
     /// The cell's index; 0 if there is none yet.
@@ -93,57 +93,65 @@ pub fn insert<M: Memory>(
     values: &[u8],
     places: &mut [Place],
 ) {
-    let mut runs = [Run::default(); GROUP];
+    let mut targets = [Target::default(); GROUP];
     let mut packed = [(0u8, Point::EMPTY); GROUP];
-    let mut last = None;
+    // Which target a cell was last, by the end of its key: points come back to cells again and
+    // again. Where two cells share an end, one becomes a target twice, which costs time alone.
+    let mut known = [0u8; GROUP];
     let mut begun = 0usize;
     let all = points.iter().zip(values).zip(&mut packed).enumerate();
-    for (at, ((point, value), (run_of, packed))) in all {
+    for (at, ((point, value), (target_of, packed))) in all {
         let Some(bin) = Bin::of(grid, point).filter(|_| which >> at & 1 != 0) else {
             continue;
         };
         let key = grid.key(bin.cell);
-        if last != Some(key) {
-            last = Some(key);
-            if let Some(run) = runs.get_mut(begun) {
-                (run.bin_cell, run.key) = (bin.cell, key);
+        let Some(known) = known.get_mut(key as usize & (GROUP - 1)) else {
+            continue;
+        };
+        let has = targets.get(usize::from(*known)).map(|target| target.key);
+        if has != Some(key) || begun == 0 {
+            *known = begun as u8;
+            if let Some(target) = targets.get_mut(begun) {
+                (target.cell, target.key) = (bin.cell, key);
             }
             begun = begun.saturating_add(1);
         }
-        *run_of = begun.wrapping_sub(1) as u8;
+        *target_of = *known;
         *packed = Point::pack(bin.position, point.normal, *value);
     }
-    let runs = runs.get_mut(..begun).unwrap_or_default();
+    let targets = targets.get_mut(..begun).unwrap_or_default();
     // Buckets and cells lie anywhere in a large memory. Loops that do nothing but read them, first
     // the ones and then the others, and whose steps do not wait for each other, have many of them
     // on their way at a time.
     let mut buckets = [Bucket::default(); GROUP];
-    for (run, bucket) in runs.iter_mut().zip(&mut buckets) {
-        run.home = grid.bucket(run.bin_cell);
-        let stored = mirror.buckets().get(run.home as usize);
+    for (target, bucket) in targets.iter_mut().zip(&mut buckets) {
+        target.home = grid.bucket(target.cell);
+        let stored = mirror.buckets().get(target.home as usize);
         *bucket = stored.copied().unwrap_or_default();
     }
-    for (run, bucket) in runs.iter_mut().zip(&buckets) {
-        run.index = find(mirror, bucket, run.key);
+    for (target, bucket) in targets.iter_mut().zip(&buckets) {
+        target.index = find(mirror, bucket, target.key);
     }
-    for ((run_of, point), place) in packed.into_iter().zip(places) {
-        let Some(run) = runs.get_mut(usize::from(run_of)) else {
+    let mut allocated = 0usize;
+    for ((target_of, point), place) in packed.into_iter().zip(places) {
+        let Some(target) = targets.get_mut(usize::from(target_of)) else {
             continue;
         };
         if point == Point::EMPTY {
             continue;
         }
-        if run.index == 0 {
-            run.index = find_or_allocate(mirror, free, run.home, run.key).unwrap_or(0);
+        if target.index == 0 {
+            let index = find_or_allocate(mirror, free, target.home, target.key, &mut allocated);
+            target.index = index.unwrap_or(0);
         }
-        let cell = mirror.cells().get(run.index as usize);
+        let cell = mirror.cells().get(target.index as usize);
         let points = cell.map(|cell| cell.points).unwrap_or_default();
-        let taken = points.iter().rev().fold(0u32, |taken, point| {
-            taken << 1 | u32::from(point.is_allocated())
+        let taken = points.iter().zip(0..).fold(0u32, |taken, (point, slot)| {
+            taken | u32::from(point.is_allocated()) << slot
         });
         let vacant = taken.trailing_ones();
-        if run.index != 0 && vacant < CELL_POINTS as u32 {
-            *place = run.index << 3 | vacant;
+        if target.index != 0 && vacant < CELL_POINTS as u32 {
+            *place = target.index << 3 | vacant;
             mirror.set_point(*place, point);
         }
     }
@@ -159,38 +167,25 @@ fn find<M: Memory>(mirror: &Mirror<M>, bucket: &Bucket, key: u32) -> u32 {
     })
 }
 
-/// A cell that came about since it was looked for, or else a new one.
+/// A cell that came about since it was looked for, or else a new one: the first free one from
+/// `allocated` on, which is the last that was taken.
 fn find_or_allocate<M: Memory>(
     mirror: &mut Mirror<M>,
     free: &mut [u64],
     home: u32,
     key: u32,
+    allocated: &mut usize,
 ) -> Option<u32> {
-    let bucket = mirror.buckets().get(home as usize).copied()?;
-    match find(mirror, &bucket, key) {
-        0 => allocate(mirror, free, home, bucket, key),
-        index => Some(index),
+    let bucket = mirror.buckets().get(home as usize)?;
+    let found = find(mirror, bucket, key);
+    if found != 0 {
+        return Some(found);
     }
-}
-
-fn allocate<M: Memory>(
-    mirror: &mut Mirror<M>,
-    free: &mut [u64],
-    home: u32,
-    mut bucket: Bucket,
-    key: u32,
-) -> Option<u32> {
+    let entry = bucket.entries.iter().position(|&entry| entry == 0)?;
     let cells = mirror.capacity().cells as usize;
-    let entry = bucket.entries.iter_mut().find(|entry| **entry == 0)?;
-    let index = dirty::first(free, cells)?;
-    *entry = index as u32;
-    let cell = Cell {
-        key,
-        ..Cell::default()
-    };
-    // Neither can fail: the index is inside the buffer, and not 0.
-    mirror.set_cell(index as u32, cell).ok()?;
-    mirror.set_bucket(home, bucket).ok()?;
+    let index = dirty::first(free, cells, *allocated)?;
+    *allocated = index;
+    mirror.begin_cell(home, entry, index as u32, key);
     dirty::unmark(free, cells, index);
     Some(index as u32)
 }

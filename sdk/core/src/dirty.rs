@@ -78,10 +78,12 @@ pub fn unmark(set: &mut [u64], len: usize, index: usize) {
     }
 }
 
-/// The lowest index in the set.
-pub fn first(set: &[u64], len: usize) -> Option<usize> {
+/// The lowest index in the set at or after `from`.
+pub fn first(set: &[u64], len: usize, from: usize) -> Option<usize> {
     let (bits, summary) = set.split_at(len.div_ceil(64));
-    (len > 0).then(|| next_set(bits, summary, 0)).flatten()
+    (from < len)
+        .then(|| next_set(bits, summary, from))
+        .flatten()
 }
 
 /// Adds every index below `len`.
@@ -187,7 +189,10 @@ mod tests {
                 }
                 let plain: Vec<usize> = (0..len).filter(|&i| flags[i]).collect();
                 assert_eq!(expected, plain);
-                assert_eq!(first(&set, len), plain.first().copied());
+                let from = random(len);
+                let after = plain.iter().find(|&&index| index >= from);
+                assert_eq!(first(&set, len, from), after.copied());
+                assert_eq!(first(&set, len, 0), plain.first().copied());
             }
             clear(&mut set, len);
             assert_eq!(next_run(&set, len, 0), None);

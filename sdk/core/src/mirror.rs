@@ -268,6 +268,30 @@ impl<M: Memory> Mirror<M> {
         Ok(())
     }
 
+    /// Gives a cell, which is all zero, a key, and names it in an entry of a bucket. What is outside
+    /// the buffers is ignored.
+    pub(crate) fn begin_cell(&mut self, home: u32, entry: usize, index: u32, key: u32) {
+        let capacity = self.capacity();
+        let parts = self.memory.parts_mut();
+        let bucket = parts.buckets.get_mut(home as usize);
+        let named = bucket.and_then(|bucket| bucket.entries.get_mut(entry));
+        let (Some(named), Some(cell)) = (named, parts.cells.get_mut(index as usize)) else {
+            return;
+        };
+        let words = [
+            (named, index, word_factor(2, home, entry as u32)),
+            (&mut cell.key, key, word_factor(3, index, 0)),
+        ];
+        for (word, value, factor) in words {
+            let change = u64::from(value).wrapping_sub(u64::from(*word));
+            self.hash = self.hash.wrapping_add(factor.wrapping_mul(change));
+            *word = value;
+        }
+        let (_, buckets, cells) = split_sets(parts.dirty, capacity);
+        dirty::mark(buckets, capacity.buckets as usize, home as usize);
+        dirty::mark(cells, capacity.cells as usize, index as usize);
+    }
+
     /// Sets one place of a cell: `place` as in [`crate::bins`]. Outside the buffer it is ignored.
     pub(crate) fn set_point(&mut self, place: u32, point: Point) {
         let (index, at) = (place >> 3, place & 7);
