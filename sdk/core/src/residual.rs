@@ -670,13 +670,22 @@ fn code_later<S: Side>(
                 return;
             };
             let wanted = side.steps(at, predicted);
-            let moved = side.coded(row, way, wanted).wrapping_mul(step);
-            let has = predicted.wrapping_add(moved).clamp(0, 255);
-            let change = has.wrapping_sub(had).clamp(-127, 127);
-            *value = has as u8;
-            *last = change as i8;
-            if let Some(part_of) = parts.get_mut(at) {
-                *part_of = part(change.wrapping_mul(NOW), change.wrapping_abs() << 1);
+            let mut keep = |has: i32| {
+                let change = has.wrapping_sub(had).clamp(-127, 127);
+                *value = has as u8;
+                *last = change as i8;
+                if let Some(part_of) = parts.get_mut(at) {
+                    *part_of = part(change.wrapping_mul(NOW), change.wrapping_abs() << 1);
+                }
+            };
+            // Apart, as the next point waits for what becomes of this: no steps are the usual
+            // case, and then nothing else has to be known for it.
+            match side.coded(row, way, wanted) {
+                0 => keep(predicted),
+                steps => {
+                    let moved = steps.wrapping_mul(step);
+                    keep(predicted.wrapping_add(moved).clamp(0, 255));
+                }
             }
         }
     }
