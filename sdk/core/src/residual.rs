@@ -315,6 +315,9 @@ pub fn encode_slice(
         target,
         free,
         quantiser,
+        per_step: (1u32 << 20)
+            .wrapping_div(u32::from(quantiser.step.max(1)))
+            .wrapping_add(1),
     };
     code_slice(&mut side, neighbours, quantiser.step, state, first);
     side.coder.finish()
@@ -359,9 +362,17 @@ struct Encode<'a> {
     target: &'a [u8],
     free: &'a [u64],
     quantiser: Quantiser,
+    /// What to multiply by in place of dividing by the step, in 1/2^20 and rounded up.
+    per_step: u32,
 }
 
 impl Encode<'_> {
+    /// Whole steps in a distance of at most 512, exactly: what rounding up adds is less than the
+    /// distance / 2^20, and so less than a step's part in one.
+    fn whole_steps(&self, far: i32) -> i32 {
+        ((far as u32).wrapping_mul(self.per_step) >> 20) as i32
+    }
+
     /// The points from `first` on, up to the next multiple of 64, that may say anything.
     fn free(&self, first: usize) -> u64 {
         let word = self.free.get(first >> 6).copied().unwrap_or_default();
@@ -426,12 +437,12 @@ impl Side for Encode<'_> {
         if target == 0 {
             // What goes beyond ends there.
             let most = far.wrapping_add(step).wrapping_sub(1);
-            return 0i32.wrapping_sub(most.checked_div(step).unwrap_or(0));
+            return 0i32.wrapping_sub(self.whole_steps(most));
         }
         if far <= i32::from(dead_zone) {
             return 0;
         }
-        let nearest = far.wrapping_add(step >> 1).checked_div(step).unwrap_or(0);
+        let nearest = self.whole_steps(far.wrapping_add(step >> 1));
         // Fewer steps cost fewer bits.
         let fewer = nearest.wrapping_sub(1);
         let rest = far.wrapping_sub(fewer.wrapping_mul(step));
