@@ -319,10 +319,10 @@ impl<M: Memory> Mirror<M> {
             .zip(values.chunks(64))
             .zip(last.chunks(64));
         let mut dirty = dirty::Marks::new(set, capacity.cells as usize);
+        let mut found = [(0u32, Point::EMPTY, Point::EMPTY); 64];
         for ((places, values), last) in runs {
             // Which points changed is hard to foretell: a branch for each would cost more.
             let mut changed = not_zero(last);
-            let mut found = [(0u32, Point::EMPTY, Point::EMPTY); 64];
             let mut count = 0;
             // Cells are far apart in a large memory. A loop that does little but read them has many
             // on their way at a time.
