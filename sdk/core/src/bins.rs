@@ -66,58 +66,126 @@ pub fn free_all(free: &mut [u64], cells: u32) {
     dirty::unmark(free, cells as usize, 0);
 }
 
-/// Stores a point in its cell; a new one if need be, the free one with the lowest index. Returns
-/// [`NOWHERE`] if the cell or its bucket is full, or no cell is free.
+/// Points that [`insert`] takes at a time.
+pub const GROUP: usize = 64;
+
+/// A cell that points of a group fall into.
+#[derive(Clone, Copy, Default)]
+struct Target {
+    cell: [u32; 3],
+    key: u32,
+    home: u32,
+    /// The cell's index; 0 if there is none yet.
+    index: u32,
+}
+
+/// Stores those points of a group whose bit is set in `which`, in order, each in its cell; a new
+/// one if need be, the free one with the lowest index. A point's place stays [`NOWHERE`] if it is
+/// outside the grid, its cell or its bucket is full, or no cell is free.
+///
+/// What is longer than the shortest, or than [`GROUP`], is left alone.
 pub fn insert<M: Memory>(
     mirror: &mut Mirror<M>,
     free: &mut [u64],
     grid: &Instance,
-    bin: Bin,
-    point: Point,
-) -> Place {
-    let (key, home) = (grid.key(bin.cell), grid.bucket(bin.cell));
-    let Some(bucket) = mirror.buckets().get(home as usize).copied() else {
-        return NOWHERE;
-    };
-    let has_key = |index: &u32| {
-        let cell = mirror.cells().get(*index as usize);
-        cell.is_some_and(|cell| cell.key == key)
-    };
-    let index = match bucket.cells().find(has_key) {
-        Some(index) => index,
-        None => match allocate(mirror, free, home, bucket, key) {
-            Some(index) => index,
-            None => return NOWHERE,
-        },
-    };
-    let cell = mirror.cells().get(index as usize).copied();
-    let vacant = cell.and_then(|cell| cell.points.iter().position(|p| !p.is_allocated()));
-    let Some(vacant) = vacant else {
-        return NOWHERE;
-    };
-    let place = index << 3 | vacant as u32;
-    mirror.set_point(place, point);
-    place
+    which: u64,
+    points: &[PatchPoint],
+    values: &[u8],
+    places: &mut [Place],
+) {
+    let mut targets = [Target::default(); GROUP];
+    let mut packed = [(0u8, Point::EMPTY); GROUP];
+    // Which target a cell was last, by the end of its key: points come back to cells again and
+    // again. Where two cells share an end, one becomes a target twice, which costs time alone.
+    let mut known = [0u8; GROUP];
+    let mut begun = 0usize;
+    let all = points.iter().zip(values).zip(&mut packed).enumerate();
+    for (at, ((point, value), (target_of, packed))) in all {
+        let Some(bin) = Bin::of(grid, point).filter(|_| which >> at & 1 != 0) else {
+            continue;
+        };
+        let key = grid.key(bin.cell);
+        let Some(known) = known.get_mut(key as usize & (GROUP - 1)) else {
+            continue;
+        };
+        let has = targets.get(usize::from(*known)).map(|target| target.key);
+        if has != Some(key) || begun == 0 {
+            *known = begun as u8;
+            if let Some(target) = targets.get_mut(begun) {
+                (target.cell, target.key) = (bin.cell, key);
+            }
+            begun = begun.saturating_add(1);
+        }
+        *target_of = *known;
+        *packed = Point::pack(bin.position, point.normal, *value);
+    }
+    let targets = targets.get_mut(..begun).unwrap_or_default();
+    // Buckets and cells lie anywhere in a large memory. Loops that do nothing but read them, first
+    // the ones and then the others, and whose steps do not wait for each other, have many of them
+    // on their way at a time.
+    let mut buckets = [Bucket::default(); GROUP];
+    for (target, bucket) in targets.iter_mut().zip(&mut buckets) {
+        target.home = grid.bucket(target.cell);
+        let stored = mirror.buckets().get(target.home as usize);
+        *bucket = stored.copied().unwrap_or_default();
+    }
+    for (target, bucket) in targets.iter_mut().zip(&buckets) {
+        target.index = find(mirror, bucket, target.key);
+    }
+    let mut allocated = 0usize;
+    for ((target_of, point), place) in packed.into_iter().zip(places) {
+        let Some(target) = targets.get_mut(usize::from(target_of)) else {
+            continue;
+        };
+        if point == Point::EMPTY {
+            continue;
+        }
+        if target.index == 0 {
+            let index = find_or_allocate(mirror, free, target.home, target.key, &mut allocated);
+            target.index = index.unwrap_or(0);
+        }
+        let cell = mirror.cells().get(target.index as usize);
+        let points = cell.map(|cell| cell.points).unwrap_or_default();
+        let taken = points.iter().zip(0..).fold(0u32, |taken, (point, slot)| {
+            taken | u32::from(point.is_allocated()) << slot
+        });
+        let vacant = taken.trailing_ones();
+        if target.index != 0 && vacant < CELL_POINTS as u32 {
+            *place = target.index << 3 | vacant;
+            mirror.set_point(*place, point);
+        }
+    }
 }
 
-fn allocate<M: Memory>(
+/// The cell of a bucket that has a key, the first of several; 0 for none.
+fn find<M: Memory>(mirror: &Mirror<M>, bucket: &Bucket, key: u32) -> u32 {
+    let cells = mirror.cells();
+    // All are looked at: where to stop would be hard to foretell.
+    bucket.entries.iter().rev().fold(0, |found, &index| {
+        let has = cells.get(index as usize).map(|cell| cell.key) == Some(key);
+        if has && index != 0 { index } else { found }
+    })
+}
+
+/// A cell that came about since it was looked for, or else a new one: the first free one from
+/// `allocated` on, which is the last that was taken.
+fn find_or_allocate<M: Memory>(
     mirror: &mut Mirror<M>,
     free: &mut [u64],
     home: u32,
-    mut bucket: Bucket,
     key: u32,
+    allocated: &mut usize,
 ) -> Option<u32> {
+    let bucket = mirror.buckets().get(home as usize)?;
+    let found = find(mirror, bucket, key);
+    if found != 0 {
+        return Some(found);
+    }
+    let entry = bucket.entries.iter().position(|&entry| entry == 0)?;
     let cells = mirror.capacity().cells as usize;
-    let entry = bucket.entries.iter_mut().find(|entry| **entry == 0)?;
-    let index = dirty::first(free, cells)?;
-    *entry = index as u32;
-    let cell = Cell {
-        key,
-        ..Cell::default()
-    };
-    // Neither can fail: the index is inside the buffer, and not 0.
-    mirror.set_cell(index as u32, cell).ok()?;
-    mirror.set_bucket(home, bucket).ok()?;
+    let index = dirty::first(free, cells, *allocated)?;
+    *allocated = index;
+    mirror.begin_cell(home, entry, index as u32, key);
     dirty::unmark(free, cells, index);
     Some(index as u32)
 }
@@ -214,7 +282,24 @@ mod tests {
                 let position = [random(32), random(32), random(32)];
                 let bin = Bin { cell, position };
                 let point = Point::pack(position, random(225) as u8, random(256) as u8);
-                let place = insert(&mut mirror, &mut free, &grid, bin, point);
+                let at = [0, 1, 2].map(|axis| cell[axis] * 32 + position[axis]);
+                let patch_point = PatchPoint {
+                    position: at,
+                    normal: point.normal(),
+                    ..PatchPoint::default()
+                };
+                assert_eq!(Bin::of(&grid, &patch_point), Some(bin));
+                let mut place = [NOWHERE];
+                insert(
+                    &mut mirror,
+                    &mut free,
+                    &grid,
+                    1,
+                    &[patch_point],
+                    &[point.occlusion()],
+                    &mut place,
+                );
+                let [place] = place;
                 let here = held.iter().filter(|(other, ..)| other.cell == cell).count();
                 if place == NOWHERE {
                     full_cells += usize::from(here == CELL_POINTS);

@@ -21,6 +21,52 @@ pub fn mark(set: &mut [u64], len: usize, index: usize) {
     }
 }
 
+/// Marks indices of which many are near each other: those of a word are gathered before the set
+/// is touched.
+pub struct Marks<'a> {
+    set: &'a mut [u64],
+    len: usize,
+    word: usize,
+    bits: u64,
+}
+
+impl<'a> Marks<'a> {
+    /// Of a set over `len` indices.
+    pub fn new(set: &'a mut [u64], len: usize) -> Marks<'a> {
+        Marks {
+            set,
+            len,
+            word: 0,
+            bits: 0,
+        }
+    }
+
+    /// Adds `index` (ignored if not below `len`).
+    pub fn mark(&mut self, index: usize) {
+        if index < self.len {
+            if index / 64 != self.word {
+                self.put();
+                self.word = index / 64;
+            }
+            self.bits |= 1 << (index % 64);
+        }
+    }
+
+    fn put(&mut self) {
+        if self.bits != 0 {
+            self.set[self.word] |= self.bits;
+            self.set[self.len.div_ceil(64) + self.word / 64] |= 1 << (self.word % 64);
+            self.bits = 0;
+        }
+    }
+}
+
+impl Drop for Marks<'_> {
+    fn drop(&mut self) {
+        self.put();
+    }
+}
+
 /// Removes `index` (ignored if not below `len`).
 pub fn unmark(set: &mut [u64], len: usize, index: usize) {
     if index < len {
@@ -32,10 +78,12 @@ pub fn unmark(set: &mut [u64], len: usize, index: usize) {
     }
 }
 
-/// The lowest index in the set.
-pub fn first(set: &[u64], len: usize) -> Option<usize> {
+/// The lowest index in the set at or after `from`.
+pub fn first(set: &[u64], len: usize, from: usize) -> Option<usize> {
     let (bits, summary) = set.split_at(len.div_ceil(64));
-    (len > 0).then(|| next_set(bits, summary, 0)).flatten()
+    (from < len)
+        .then(|| next_set(bits, summary, from))
+        .flatten()
 }
 
 /// Adds every index below `len`.
@@ -141,7 +189,10 @@ mod tests {
                 }
                 let plain: Vec<usize> = (0..len).filter(|&i| flags[i]).collect();
                 assert_eq!(expected, plain);
-                assert_eq!(first(&set, len), plain.first().copied());
+                let from = random(len);
+                let after = plain.iter().find(|&&index| index >= from);
+                assert_eq!(first(&set, len, from), after.copied());
+                assert_eq!(first(&set, len, 0), plain.first().copied());
             }
             clear(&mut set, len);
             assert_eq!(next_run(&set, len, 0), None);

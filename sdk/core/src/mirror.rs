@@ -268,6 +268,30 @@ impl<M: Memory> Mirror<M> {
         Ok(())
     }
 
+    /// Gives a cell, which is all zero, a key, and names it in an entry of a bucket. What is outside
+    /// the buffers is ignored.
+    pub(crate) fn begin_cell(&mut self, home: u32, entry: usize, index: u32, key: u32) {
+        let capacity = self.capacity();
+        let parts = self.memory.parts_mut();
+        let bucket = parts.buckets.get_mut(home as usize);
+        let named = bucket.and_then(|bucket| bucket.entries.get_mut(entry));
+        let (Some(named), Some(cell)) = (named, parts.cells.get_mut(index as usize)) else {
+            return;
+        };
+        let words = [
+            (named, index, word_factor(2, home, entry as u32)),
+            (&mut cell.key, key, word_factor(3, index, 0)),
+        ];
+        for (word, value, factor) in words {
+            let change = u64::from(value).wrapping_sub(u64::from(*word));
+            self.hash = self.hash.wrapping_add(factor.wrapping_mul(change));
+            *word = value;
+        }
+        let (_, buckets, cells) = split_sets(parts.dirty, capacity);
+        dirty::mark(buckets, capacity.buckets as usize, home as usize);
+        dirty::mark(cells, capacity.cells as usize, index as usize);
+    }
+
     /// Sets one place of a cell: `place` as in [`crate::bins`]. Outside the buffer it is ignored.
     pub(crate) fn set_point(&mut self, place: u32, point: Point) {
         let (index, at) = (place >> 3, place & 7);
@@ -294,26 +318,35 @@ impl<M: Memory> Mirror<M> {
             .chunks(64)
             .zip(values.chunks(64))
             .zip(last.chunks(64));
+        let mut dirty = dirty::Marks::new(set, capacity.cells as usize);
+        let mut found = [(0u32, Point::EMPTY, Point::EMPTY); 64];
         for ((places, values), last) in runs {
             // Which points changed is hard to foretell: a branch for each would cost more.
             let mut changed = not_zero(last);
+            let mut count = 0;
+            // Cells are far apart in a large memory. A loop that does little but read them has many
+            // on their way at a time.
             while changed != 0 {
                 let which = changed.trailing_zeros() as usize;
                 changed &= changed - 1;
-                let (Some(place), Some(value)) = (places.get(which), values.get(which)) else {
+                let (Some(&place), Some(&value)) = (places.get(which), values.get(which)) else {
                     break;
                 };
-                let (index, at) = (place >> 3, place & 7);
                 // NOWHERE's place in a cell is one that no cell has.
-                let cell = parts.cells.get_mut(index as usize);
-                if let Some(point) = cell.and_then(|cell| cell.points.get_mut(at as usize)) {
-                    // Occlusion is a word's lowest byte; word 0 is the key.
-                    let change = u64::from(*value).wrapping_sub(u64::from(point.occlusion()));
-                    let factor = word_factor(3, index, at + 1);
-                    self.hash = self.hash.wrapping_add(factor.wrapping_mul(change));
-                    *point = point.with_occlusion(*value);
-                    dirty::mark(set, capacity.cells as usize, index as usize);
+                let cell = parts.cells.get((place >> 3) as usize);
+                if let Some(point) = cell.and_then(|cell| cell.points.get((place & 7) as usize)) {
+                    found[count] = (place, *point, point.with_occlusion(value));
+                    count += 1;
                 }
+            }
+            for (place, had, has) in &found[..count] {
+                let (index, at) = (place >> 3, place & 7);
+                let change = u64::from(has.0).wrapping_sub(u64::from(had.0));
+                // Word 0 is the key.
+                let factor = word_factor(3, index, at + 1);
+                self.hash = self.hash.wrapping_add(factor.wrapping_mul(change));
+                parts.cells[index as usize].points[at as usize] = *has;
+                dirty.mark(index as usize);
             }
         }
     }

@@ -52,93 +52,183 @@ pub struct Neighbours {
 /// What is longer than the other, or than [`SLICE_POINTS`], is left alone.
 pub fn find_neighbours(points: &[PatchPoint], out: &mut [Neighbours]) {
     let count = points.len().min(out.len()).min(SLICE_POINTS);
-    // Coordinates side by side, so that distances to a whole window are computed at once: in 16 bits,
-    // which every processor multiplies many of at a time, where a patch is as small as most are.
-    let corner = points.first().map_or([0; 3], |point| point.position);
-    let mut axes = [[0i32; SLICE_POINTS]; 3];
-    let mut small = [[0i16; SLICE_POINTS]; 3];
-    let mut fits = true;
-    for (axis, ((places, small), corner)) in axes.iter_mut().zip(&mut small).zip(corner).enumerate()
-    {
-        let places = places.iter_mut().zip(small).take(count);
-        for ((place, small), point) in places.zip(points) {
-            let position = point.position.get(axis).copied().unwrap_or_default();
-            *place = position.wrapping_sub(corner) as i32;
-            *small = *place as i16;
-            fits &= place.unsigned_abs() <= FAR as u32 / 2;
+    let points = points.get(..count).unwrap_or_default();
+    let out = out.get_mut(..count).unwrap_or_default();
+    if !find_near_neighbours(points, out) {
+        for (at, out) in out.iter_mut().enumerate() {
+            *out = search(points, at);
         }
-    }
-    let mut later = [NONE; SLICE_POINTS];
-    // How near one has to be to be among them.
-    let mut later_wanted = [i32::MAX; SLICE_POINTS];
-    let mut squares = [0i32; WINDOW];
-    for at in 0..count {
-        let start = at.saturating_sub(WINDOW);
-        if fits {
-            square_distances(&small, start..at, &mut squares, |p, q| {
-                i32::from(p.wrapping_sub(q))
-            });
-        } else {
-            square_distances(&axes, start..at, &mut squares, |p, q| {
-                p.wrapping_sub(q).clamp(-FAR, FAR)
-            });
-        }
-        let mut earlier = NONE;
-        let mut earlier_wanted = i32::MAX;
-        let (Some(point), Some(others), Some(laters), Some(laters_wanted)) = (
-            points.get(at),
-            points.get(start..at),
-            later.get_mut(start..at),
-            later_wanted.get_mut(start..at),
-        ) else {
-            break;
-        };
-        let others = others.iter().zip(laters).zip(laters_wanted).zip(&squares);
-        for (back, (((other, other_later), other_wanted), square)) in (1u8..).zip(others.rev()) {
-            // Facing another way only adds.
-            if *square >= earlier_wanted.max(*other_wanted) {
-                continue;
-            }
-            let squared = *square as u32;
-            let apart = squared.saturating_add(turned(squared, point.normal, other.normal));
-            let candidate = u64::from(apart) << 8 | u64::from(back);
-            keep(&mut earlier, candidate);
-            earlier_wanted = farthest(&earlier);
-            keep(other_later, candidate);
-            *other_wanted = farthest(other_later);
-        }
-        if let Some(out) = out.get_mut(at) {
-            out.earlier = earlier.map(|candidate| candidate as u8);
-        }
-    }
-    for (out, later) in out.iter_mut().zip(&later).take(count) {
-        out.later = later.map(|candidate| candidate as u8);
     }
 }
 
-/// Squared distances of a window's points from the one behind it; `apart` says how far two
-/// coordinates are apart.
-fn square_distances<T: Copy>(
-    axes: &[[T; SLICE_POINTS]; 3],
-    window: core::ops::Range<usize>,
-    squares: &mut [i32; WINDOW],
-    apart: impl Fn(T, T) -> i32,
-) {
-    let end = window.end;
-    let [Some((xs, x)), Some((ys, y)), Some((zs, z))] = axes
-        .each_ref()
-        .map(|axis| axis.get(window.clone()).zip(axis.get(end).copied()))
-    else {
-        return;
+/// Bits of a key of [`find_near_neighbours`] that say how far away in the order a point is.
+const KEY_BITS: u32 = (WINDOW as u32).ilog2().wrapping_add(1);
+
+/// Squared distances from here on count as this in such a key, so that it fits.
+const NEAR: i32 = 1 << 21;
+
+/// The key of no point at all, greater than any.
+const NO_KEY: i32 = i32::MAX >> KEY_BITS << KEY_BITS;
+
+/// The same for patches as small as most are; others it refuses (false).
+///
+/// It goes through all points once for each distance in the order, so that processors compute many
+/// points side by side, and there is nothing to foretell.
+fn find_near_neighbours(points: &[PatchPoint], out: &mut [Neighbours]) -> bool {
+    let count = points.len();
+    let Some(first) = points.first() else {
+        return true;
     };
-    let square = |p: T, q: T| {
-        let apart = apart(p, q);
-        apart.wrapping_mul(apart)
-    };
-    for (((sum, px), py), pz) in squares.iter_mut().zip(xs).zip(ys).zip(zs) {
-        let [x, y, z] = [square(*px, x), square(*py, y), square(*pz, z)];
-        *sum = x.wrapping_add(y).wrapping_add(z);
+    let mut axes = [[0i16; SLICE_POINTS]; 3];
+    let mut normals = [[0i16; SLICE_POINTS]; 3];
+    let mut codes = [0u8; SLICE_POINTS];
+    let (mut fits, mut flat) = (true, true);
+    for (at, (point, code)) in points.iter().zip(&mut codes).enumerate() {
+        *code = point.normal;
+        flat &= point.normal == first.normal;
+        let normal = normal_steps(point.normal);
+        for axis in 0..3u8 {
+            let place = axis_of(&point.position, axis).wrapping_sub(axis_of(&first.position, axis));
+            let place = place as i32;
+            fits &= place.unsigned_abs() <= FAR as u32 / 2;
+            let axis_place = axes
+                .get_mut(usize::from(axis))
+                .and_then(|axis| axis.get_mut(at));
+            let axis_normal = normals
+                .get_mut(usize::from(axis))
+                .and_then(|axis| axis.get_mut(at));
+            if let (Some(to), Some(to_normal)) = (axis_place, axis_normal) {
+                *to = place as i16;
+                *to_normal = axis_of(&normal, axis) as i16;
+            }
+        }
     }
+    if !fits {
+        return false;
+    }
+    let mut earlier = [[NO_KEY; SLICE_POINTS]; NEIGHBOURS];
+    let mut later = [[NO_KEY; SLICE_POINTS]; NEIGHBOURS];
+    let mut keys = [0i32; SLICE_POINTS];
+    for back in 1..=WINDOW.min(count.wrapping_sub(1)) {
+        let Some(keys) = keys.get_mut(..count.wrapping_sub(back)) else {
+            break;
+        };
+        let product = |p: i16, q: i16| i32::from(p).wrapping_mul(i32::from(q));
+        let square = |p: i16, q: i16| product(p.wrapping_sub(q), p.wrapping_sub(q));
+        of_pairs(&axes, back, keys, square);
+        for key in &mut *keys {
+            *key = (*key).min(NEAR);
+        }
+        if !flat {
+            let mut along = [0i32; SLICE_POINTS];
+            let along = along.get_mut(..keys.len()).unwrap_or_default();
+            of_pairs(&normals, back, along, product);
+            let codes = codes.iter().zip(codes.get(back..).unwrap_or_default());
+            for ((key, along), (p, q)) in keys.iter_mut().zip(along).zip(codes) {
+                let turned = if p == q { 0 } else { turned(*along) };
+                let more = key.wrapping_mul(turned) >> 5;
+                *key = key.wrapping_add(turned << 1).wrapping_add(more);
+            }
+        }
+        for key in &mut *keys {
+            *key = *key << KEY_BITS | back as i32;
+        }
+        keep_keys(&mut earlier, back, keys);
+        keep_keys(&mut later, 0, keys);
+    }
+    let mask = NO_KEY ^ i32::MAX;
+    let [[e0, e1], [l0, l1]] = [&earlier, &later];
+    let found = e0.iter().zip(e1).zip(l0.iter().zip(l1));
+    for (at, (out, ((e0, e1), (l0, l1)))) in out.iter_mut().zip(found).enumerate() {
+        let far = |key: i32| key >= NEAR << KEY_BITS && key != NO_KEY;
+        if far(*e1) || far(*l1) {
+            *out = search(points, at);
+            continue;
+        }
+        out.earlier = [*e0, *e1].map(|key| (key & mask) as u8);
+        out.later = [*l0, *l1].map(|key| (key & mask) as u8);
+    }
+    true
+}
+
+/// For each point the sum over the axes of what `of` makes of its number and that of the point so
+/// far `back`; the first of `out` is of the first point that has one there.
+fn of_pairs(
+    axes: &[[i16; SLICE_POINTS]; 3],
+    back: usize,
+    out: &mut [i32],
+    of: impl Fn(i16, i16) -> i32,
+) {
+    let [x, y, z] = axes.each_ref().map(|axis| {
+        let after = axis.get(back..).unwrap_or_default();
+        axis.iter().zip(after)
+    });
+    for (((out, x), y), z) in out.iter_mut().zip(x).zip(y).zip(z) {
+        let [x, y, z] = [x, y, z].map(|(p, q)| of(*p, *q));
+        *out = x.wrapping_add(y).wrapping_add(z);
+    }
+}
+
+/// Keeps of each point, from `start` on, its key if that is among the least.
+fn keep_keys(least: &mut [[i32; SLICE_POINTS]; NEIGHBOURS], start: usize, keys: &[i32]) {
+    let [first, second] = least;
+    let first = first.get_mut(start..).unwrap_or_default();
+    let second = second.get_mut(start..).unwrap_or_default();
+    for ((first, second), key) in first.iter_mut().zip(second).zip(keys) {
+        let more = (*first).max(*key);
+        *first = (*first).min(*key);
+        *second = (*second).min(more);
+    }
+}
+
+fn axis_of<T: Copy + Default>(values: &[T; 3], axis: u8) -> T {
+    values.get(usize::from(axis)).copied().unwrap_or_default()
+}
+
+/// The neighbours of a point of any patch, by a search through the window around it.
+fn search(points: &[PatchPoint], at: usize) -> Neighbours {
+    let (before, after) = points.split_at_checked(at).unwrap_or_default();
+    let Some((point, after)) = after.split_first() else {
+        return Neighbours::default();
+    };
+    Neighbours {
+        earlier: nearest(point, before.iter().rev()),
+        later: nearest(point, after.iter()),
+    }
+}
+
+fn nearest<'a>(
+    point: &PatchPoint,
+    others: impl Iterator<Item = &'a PatchPoint>,
+) -> [u8; NEIGHBOURS] {
+    let mut nearest = NONE;
+    for (by, other) in (1u8..).zip(others.take(WINDOW)) {
+        keep(
+            &mut nearest,
+            u64::from(apart(point, other)) << 8 | u64::from(by),
+        );
+    }
+    nearest.map(|candidate| candidate as u8)
+}
+
+/// How far apart two points count as.
+fn apart(p: &PatchPoint, q: &PatchPoint) -> u32 {
+    let axes = p.position.into_iter().zip(q.position);
+    let squared = axes.fold(0u32, |sum, (p, q)| {
+        let apart = (p.wrapping_sub(q) as i32).clamp(-FAR, FAR);
+        sum.wrapping_add(apart.wrapping_mul(apart) as u32)
+    });
+    if p.normal == q.normal {
+        return squared;
+    }
+    let axes = normal_steps(p.normal)
+        .into_iter()
+        .zip(normal_steps(q.normal));
+    let along = axes.fold(0i32, |sum, (p, q)| sum.wrapping_add(p.wrapping_mul(q)));
+    let turned = turned(along) as u32;
+    let more = u64::from(squared).wrapping_mul(u64::from(turned)) >> 5;
+    let more = u32::try_from(more).unwrap_or(u32::MAX);
+    squared.saturating_add((turned << 1).saturating_add(more))
 }
 
 /// Coordinates that differ by more count as differing by this.
@@ -148,33 +238,16 @@ const FAR: i32 = 1 << 14;
 /// order.
 const NONE: [u64; NEIGHBOURS] = [(u32::MAX as u64) << 8; NEIGHBOURS];
 
-/// A distance that a nearer one must be below.
-fn farthest(nearest: &[u64; NEIGHBOURS]) -> i32 {
-    let [.., farthest] = nearest;
-    i32::try_from(farthest >> 8).unwrap_or(i32::MAX)
+/// How much two points that face different ways are turned from each other, by the product of
+/// their normals: 0 where it is little, about 500 where they are opposite. They count as farther
+/// apart by it, as what is on the other side of an edge or a wall says little.
+fn turned(along: i32) -> i32 {
+    127i32.wrapping_mul(127).wrapping_sub(along).max(0) >> 6
 }
 
-/// How much farther apart two points count because they face different ways: what is on the other
-/// side of an edge or a wall says little.
-fn turned(squared: u32, p: u8, q: u8) -> u32 {
-    if p == q {
-        return 0;
-    }
-    let normal = |code: u8| {
-        NORMAL_STEPS
-            .get(usize::from(code))
-            .copied()
-            .unwrap_or_default()
-    };
-    let ([px, py, pz], [qx, qy, qz]) = (normal(p), normal(q));
-    let along = |p: i32, q: i32| p.wrapping_mul(q);
-    let dot = along(px, qx)
-        .wrapping_add(along(py, qy))
-        .wrapping_add(along(pz, qz));
-    // 0 where they face the same way, about 500 where opposite.
-    let turned = (127i32.wrapping_mul(127).wrapping_sub(dot).max(0) as u32) >> 6;
-    let more = u64::from(squared).wrapping_mul(u64::from(turned)) >> 5;
-    (turned << 1).saturating_add(u32::try_from(more).unwrap_or(u32::MAX))
+fn normal_steps(code: u8) -> [i32; 3] {
+    let steps = NORMAL_STEPS.get(usize::from(code));
+    steps.copied().unwrap_or_default()
 }
 
 /// Keeps a candidate if it is among the nearest; of equally near ones, the nearest in the order.
@@ -242,6 +315,9 @@ pub fn encode_slice(
         target,
         free,
         quantiser,
+        per_step: (1u32 << 20)
+            .wrapping_div(u32::from(quantiser.step.max(1)))
+            .wrapping_add(1),
     };
     code_slice(&mut side, neighbours, quantiser.step, state, first);
     side.coder.finish()
@@ -286,9 +362,17 @@ struct Encode<'a> {
     target: &'a [u8],
     free: &'a [u64],
     quantiser: Quantiser,
+    /// What to multiply by in place of dividing by the step, in 1/2^20 and rounded up.
+    per_step: u32,
 }
 
 impl Encode<'_> {
+    /// Whole steps in a distance of at most 512, exactly: what rounding up adds is less than the
+    /// distance / 2^20, and so less than a step's part in one.
+    fn whole_steps(&self, far: i32) -> i32 {
+        ((far as u32).wrapping_mul(self.per_step) >> 20) as i32
+    }
+
     /// The points from `first` on, up to the next multiple of 64, that may say anything.
     fn free(&self, first: usize) -> u64 {
         let word = self.free.get(first >> 6).copied().unwrap_or_default();
@@ -353,12 +437,12 @@ impl Side for Encode<'_> {
         if target == 0 {
             // What goes beyond ends there.
             let most = far.wrapping_add(step).wrapping_sub(1);
-            return 0i32.wrapping_sub(most.checked_div(step).unwrap_or(0));
+            return 0i32.wrapping_sub(self.whole_steps(most));
         }
         if far <= i32::from(dead_zone) {
             return 0;
         }
-        let nearest = far.wrapping_add(step >> 1).checked_div(step).unwrap_or(0);
+        let nearest = self.whole_steps(far.wrapping_add(step >> 1));
         // Fewer steps cost fewer bits.
         let fewer = nearest.wrapping_sub(1);
         let rest = far.wrapping_sub(fewer.wrapping_mul(step));
@@ -597,13 +681,22 @@ fn code_later<S: Side>(
                 return;
             };
             let wanted = side.steps(at, predicted);
-            let moved = side.coded(row, way, wanted).wrapping_mul(step);
-            let has = predicted.wrapping_add(moved).clamp(0, 255);
-            let change = has.wrapping_sub(had).clamp(-127, 127);
-            *value = has as u8;
-            *last = change as i8;
-            if let Some(part_of) = parts.get_mut(at) {
-                *part_of = part(change.wrapping_mul(NOW), change.wrapping_abs() << 1);
+            let mut keep = |has: i32| {
+                let change = has.wrapping_sub(had).clamp(-127, 127);
+                *value = has as u8;
+                *last = change as i8;
+                if let Some(part_of) = parts.get_mut(at) {
+                    *part_of = part(change.wrapping_mul(NOW), change.wrapping_abs() << 1);
+                }
+            };
+            // Apart, as the next point waits for what becomes of this: no steps are the usual
+            // case, and then nothing else has to be known for it.
+            match side.coded(row, way, wanted) {
+                0 => keep(predicted),
+                steps => {
+                    let moved = steps.wrapping_mul(step);
+                    keep(predicted.wrapping_add(moved).clamp(0, 255));
+                }
             }
         }
     }
@@ -1076,7 +1169,12 @@ mod tests {
     #[test]
     fn neighbours_are_those_of_a_search_through_all_pairs() {
         let mut random = Random(5);
-        for (count, spread) in [(1, 9), (2, 1), (40, 3), (300, 40), (1024, 1 << 25)] {
+        let spreads = [3, 40, 3000, 5000, 1 << 14, 1 << 25];
+        let sizes = spreads.map(|spread| (300, spread));
+        for (count, spread) in [(1, 9), (2, 1), (2, 9000), (1024, 40)]
+            .into_iter()
+            .chain(sizes)
+        {
             let points: Vec<PatchPoint> = (0..count)
                 .map(|_| PatchPoint {
                     position: [0; 3].map(|_| random.below(spread)),
@@ -1084,13 +1182,6 @@ mod tests {
                     ..PatchPoint::default()
                 })
                 .collect();
-            let apart = |p: &PatchPoint, q: &PatchPoint| {
-                let far = p.position.iter().zip(&q.position);
-                let squared = far
-                    .map(|(p, q)| p.abs_diff(*q).min(FAR as u32).pow(2))
-                    .sum();
-                u32::saturating_add(squared, turned(squared, p.normal, q.normal))
-            };
             let mut found = vec![Neighbours::default(); count];
             find_neighbours(&points, &mut found);
             for (at, found) in found.iter().enumerate() {

@@ -10,10 +10,9 @@
     clippy::arithmetic_side_effects
 )]
 
-use crate::bins::{self, Bin, NOWHERE, Place};
+use crate::bins::{self, Bin, GROUP, NOWHERE, Place};
 use crate::grid::Instance;
 use crate::mirror::{Memory, Mirror};
-use crate::point::Point;
 use crate::residual::{BLOCK, Neighbours, Quantiser, SliceState, decode_slice, find_neighbours};
 use crate::stream::{Changes, Reader, StreamError, Writer, apply_changes};
 use crate::topology::{PatchPoint, decode_patch};
@@ -25,6 +24,9 @@ pub const FIRST: Quantiser = Quantiser {
     step: 1,
     dead_zone: 0,
 };
+
+/// In place of a point's last change: it is no open slice's.
+pub const NOBODYS: i8 = i8::MIN;
 
 /// Where a patch's bytes are.
 #[repr(C)]
@@ -85,7 +87,7 @@ pub struct Slices<'a> {
     pub topology_used: &'a mut u32,
     /// Each point's occlusion; 255 is open.
     pub values: &'a mut [u8],
-    /// Each point's last change; as many as values.
+    /// Each point's last change, or [`NOBODYS`]; as many as values.
     pub last: &'a mut [i8],
     /// Each point's neighbours; as many as values.
     pub neighbours: &'a mut [Neighbours],
@@ -283,11 +285,8 @@ impl Slices<'_> {
             shown: 0,
         };
         let range = opened.range();
-        let apart = |other: &Slice| {
-            let other = other.range();
-            other.is_empty() || other.end <= range.start || other.start >= range.end
-        };
-        let usable = count > 0 && range.end <= self.values.len() && self.slices.iter().all(apart);
+        let nobodys = |last: &[i8]| last.iter().all(|last| *last == NOBODYS);
+        let usable = count > 0 && self.last.get(range.clone()).is_some_and(nobodys);
         let points = self.scratch.get(..count).unwrap_or_default();
         let (true, Some(neighbours), Some(values), Some(last), Some(places), Some(slice)) = (
             usable,
@@ -385,14 +384,12 @@ impl Slices<'_> {
                 *place = NOWHERE;
             }
         }
-        let entering = points.iter().zip(values).zip(places).enumerate();
-        for (at, ((point, value), place)) in entering {
-            if is(shown & !slice.shown, at)
-                && let Some(bin) = Bin::of(&grid, point)
-            {
-                let point = Point::pack(bin.position, point.normal, *value);
-                *place = bins::insert(mirror, self.free, &grid, bin, point);
-            }
+        let mut entering = shown & !slice.shown;
+        let groups = points.chunks(GROUP).zip(values.chunks(GROUP));
+        for ((points, values), places) in groups.zip(places.chunks_mut(GROUP)) {
+            let which = points_of(entering);
+            bins::insert(mirror, self.free, &grid, which, points, values, places);
+            entering >>= GROUP.wrapping_div(BLOCK);
         }
         if let Some(slice) = self.slices.get_mut(index as usize) {
             slice.shown = shown;
@@ -410,8 +407,10 @@ impl Slices<'_> {
         index: u32,
     ) -> Result<(), StreamError> {
         self.show(mirror, index, 0)?;
+        let closed = Slice::default();
         if let Some(slice) = self.slices.get_mut(index as usize) {
-            *slice = Slice::default();
+            let range = core::mem::replace(slice, closed).range();
+            self.last.get_mut(range).unwrap_or_default().fill(NOBODYS);
         }
         Ok(())
     }
@@ -426,6 +425,7 @@ impl Slices<'_> {
     /// Closes all slices, for a snapshot; the mirror is reset beside it. Patches stay.
     pub fn reset(&mut self, cells: u32) {
         self.slices.fill(Slice::default());
+        self.last.fill(NOBODYS);
         bins::free_all(self.free, cells);
     }
 
@@ -434,6 +434,15 @@ impl Slices<'_> {
         let of = |slice: &Slice| slice.point_count != 0 && slice.instance == instance;
         self.slices.iter().any(of)
     }
+}
+
+/// The points of a group's blocks, the first in the lowest bit.
+fn points_of(blocks: u64) -> u64 {
+    const FIRST_BLOCK: u64 = (1 << BLOCK) - 1;
+    let blocks = (0..GROUP.wrapping_div(BLOCK)).map(|block| (block, blocks >> block & 1));
+    blocks.fold(0, |points, (block, shown)| {
+        points | shown.wrapping_mul(FIRST_BLOCK << block.wrapping_mul(BLOCK))
+    })
 }
 
 fn grid_of<M: Memory>(mirror: &Mirror<M>, instance: u32) -> Result<Instance, StreamError> {

@@ -299,10 +299,12 @@ impl Side for Encode<'_> {
 struct Decode<'a>(Decoder<'a>);
 
 impl Side for Decode<'_> {
+    #[inline(always)]
     fn bit(&mut self, odds: &mut Odds, _: bool) -> bool {
         self.0.bit(odds)
     }
 
+    #[inline(always)]
     fn bits(&mut self, count: u32, _: u32) -> u32 {
         self.0.bits(count)
     }
@@ -934,18 +936,23 @@ fn predict(
         1 => [x, z, y],
         _ => [x, y, z],
     };
-    let [u, v, _] = of(offset.map(i64::from));
-    let mut nearest = (i64::MAX, [0; 3]);
-    for point in back.iter().rev() {
+    let by = |point: &PatchPoint| {
         let [from_u, from_v, from] = of(frame.offset(point.position).map(i64::from));
-        let (by_u, by_v) = (u.wrapping_sub(from_u), v.wrapping_sub(from_v));
-        let turned = i64::from(point.normal != normal) << 6;
-        let far = by_u.abs().wrapping_add(by_v.abs()).wrapping_add(turned);
-        if far < nearest.0 {
-            nearest = (far, [by_u, by_v, from]);
-        }
-    }
-    let [by_u, by_v, from] = nearest.1;
+        let [u, v, _] = of(offset.map(i64::from));
+        [u.wrapping_sub(from_u), v.wrapping_sub(from_v), from]
+    };
+    // The least of numbers whose lowest byte tells which they are of: which it will be is hard to
+    // foretell.
+    let least = back.iter().rev().zip(0u64..).map(|(point, which)| {
+        let [by_u, by_v, _] = by(point);
+        let turned = u64::from(point.normal != normal) << 6;
+        let far = by_u.unsigned_abs().wrapping_add(by_v.unsigned_abs());
+        far.wrapping_add(turned) << 8 | which
+    });
+    let nearest = least
+        .min()
+        .and_then(|least| back.iter().rev().nth((least & 0xff) as usize));
+    let [by_u, by_v, from] = nearest.map(by).unwrap_or_default();
     let [step_u, step_v, rise] = of(steps.map(i64::from));
     let slope = by_u
         .wrapping_mul(step_u)
