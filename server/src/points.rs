@@ -23,8 +23,8 @@ use std::fmt;
 /// root mean square; two random ones 0.85), in a third of the time.
 const CANDIDATES_PER_POINT: f64 = 2.0;
 
-/// Most points of one mesh. Making them takes about 100 bytes a candidate: up to 3.4 GB, and as
-/// much again where all is thin.
+/// Most points of one mesh. Making them takes about 100 bytes a candidate: up to 3.4 GB, and twice
+/// that where all is thin.
 pub const MAX_POINTS: u64 = 1 << 24;
 
 /// A sample on a mesh's surface: where it is never changes; its position and normal follow from

@@ -8,7 +8,7 @@ use crate::scene::Mesh;
 use crate::topology::Fast;
 use glam::{DVec3, IVec3, Vec3};
 use rayon::prelude::*;
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 
 /// How near a candidate is to lie to every place, largest radii: a lookup reads at least so far
 /// along each axis.
@@ -25,7 +25,7 @@ const STEP: f64 = 0.5;
 
 /// Most places that are looked at for each candidate, besides one a triangle and side: there is no
 /// end to what needles may be long.
-const MOST_PLACES: f64 = 0.5;
+const MOST_PLACES: f64 = 2.0;
 
 /// Adds candidates along triangles that are narrow, on each of `sides`, where none is near; `radius`
 /// is the largest radius in metres. At most `most`, evenly many everywhere, so that what is thin does
@@ -148,10 +148,15 @@ impl Triangle {
 /// Candidates by place, in cubes as long as the distance that counts as near.
 struct Known {
     near: f64,
-    /// The last candidate of each cube that matters.
-    last: HashMap<[i32; 3], Option<u32>, Fast>,
+    /// Where candidates matter: cubes `COARSE` times as long.
+    around: HashSet<[i32; 3], Fast>,
+    /// The last candidate of each cube.
+    last: HashMap<[i32; 3], u32, Fast>,
     all: Vec<One>,
 }
+
+/// A place is in reach of one or two of them an axis, and the next place mostly of the same.
+const COARSE: f64 = 4.0;
 
 struct One {
     at: DVec3,
@@ -163,39 +168,43 @@ struct One {
 impl Known {
     /// None yet; those in reach of `places` will matter.
     fn around(near: f64, places: impl Iterator<Item = DVec3>) -> Known {
-        let mut known = Known {
-            near,
-            last: HashMap::default(),
-            all: Vec::new(),
-        };
+        let mut around = HashSet::default();
         let mut before = None;
         for at in places {
-            let cube = known.cube(at);
-            if before.replace(cube) != Some(cube) {
-                known.last.extend(beside(cube).map(|cube| (cube, None)));
+            let reach = [at - near, at + near].map(|at| cube(at, COARSE * near));
+            if before.replace(reach) == Some(reach) {
+                continue;
+            }
+            for corner in 0..8 {
+                around.insert([0, 1, 2].map(|axis| reach[corner >> axis & 1][axis]));
             }
         }
-        known
-    }
-
-    fn cube(&self, at: DVec3) -> IVec3 {
-        (at / self.near).floor().as_ivec3()
+        Known {
+            near,
+            around,
+            last: HashMap::default(),
+            all: Vec::new(),
+        }
     }
 
     fn is_around(&self, at: DVec3) -> bool {
-        self.last.contains_key(&self.cube(at).to_array())
+        self.around
+            .contains(&cube(at, COARSE * self.near).to_array())
     }
 
     fn add(&mut self, at: DVec3, normal: Vec3) {
-        let cube = self.cube(at).to_array();
-        let number = Some(self.all.len() as u32);
-        let before = self.last.insert(cube, number).flatten();
+        let cube = cube(at, self.near).to_array();
+        let before = self.last.insert(cube, self.all.len() as u32);
         self.all.push(One { at, normal, before });
     }
 
     fn has_near(&self, at: DVec3, normal: Vec3) -> bool {
-        beside(self.cube(at)).any(|cube| {
-            let mut next = self.last.get(&cube).copied().flatten();
+        let middle = cube(at, self.near);
+        // The cube itself first: most often that is enough.
+        (0..27).map(|k| (k + 13) % 27).any(|k| {
+            let by = IVec3::new(k % 3, k / 3 % 3, k / 9) - 1;
+            let beside = middle.wrapping_add(by).to_array();
+            let mut next = self.last.get(&beside).copied();
             while let Some(number) = next {
                 let one = &self.all[number as usize];
                 let is_near = one.at.distance_squared(at) < self.near * self.near;
@@ -209,13 +218,9 @@ impl Known {
     }
 }
 
-/// A cube, and then those around it.
-fn beside(cube: IVec3) -> impl Iterator<Item = [i32; 3]> {
-    (0..27).map(move |k| {
-        let k = (k + 13) % 27;
-        let by = IVec3::new(k % 3, k / 3 % 3, k / 9) - 1;
-        cube.wrapping_add(by).to_array()
-    })
+/// The cube of a length that has a place.
+fn cube(at: DVec3, length: f64) -> IVec3 {
+    (at / length).floor().as_ivec3()
 }
 
 #[cfg(test)]
@@ -265,7 +270,7 @@ mod tests {
 
     #[test]
     fn wires_take_at_most_a_quarter_of_the_points_from_a_floor_and_none_if_that_is_hopeless() {
-        for (length, at_least, at_most) in [(18.0, 760, 800), (50.0, 1015, 1035)] {
+        for (length, at_least, at_most) in [(50.0, 760, 800), (100.0, 1005, 1035)] {
             let mesh = floor_and_strip(length, 4e-4, 1);
             let set = generate(&mesh, Vec3::ONE, 256.0, 1).unwrap();
             let floor = set.points.iter().filter(|point| point.triangle < 2);
