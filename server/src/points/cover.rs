@@ -29,7 +29,7 @@ const MOST_PLACES: f64 = 2.0;
 
 /// Adds candidates along triangles that are narrow, on each of `sides`, where none is near; `radius`
 /// is the largest radius in metres. At most `most`, evenly many everywhere, so that what is thin does
-/// not take all points from what is not; none where there is so much of it that this were hopeless.
+/// not take all points from what is not.
 pub(super) fn cover(
     mesh: &Mesh,
     metric: Vec3,
@@ -47,9 +47,6 @@ pub(super) fn cover(
     let length: f64 = (0..triangles).filter_map(narrow).map(|n| n.length).sum();
     let places = MOST_PLACES * candidates.len().max(1) as f64;
     let step = (STEP * radius).max(length * f64::from(sides) / places);
-    if step > near {
-        return;
-    }
     let places = || {
         (0..triangles).filter_map(narrow).flat_map(|triangle| {
             let count = (triangle.length / step).ceil().max(1.0) as u32;
@@ -269,13 +266,13 @@ mod tests {
     }
 
     #[test]
-    fn wires_take_at_most_a_quarter_of_the_points_from_a_floor_and_none_if_that_is_hopeless() {
-        for (length, at_least, at_most) in [(50.0, 760, 800), (100.0, 1005, 1035)] {
+    fn wires_take_at_most_a_quarter_of_the_points_from_a_floor_however_long_they_are() {
+        for (length, at_least) in [(50.0, 750), (100.0, 740)] {
             let mesh = floor_and_strip(length, 4e-4, 1);
             let set = generate(&mesh, Vec3::ONE, 256.0, 1).unwrap();
             let floor = set.points.iter().filter(|point| point.triangle < 2);
             let floor = floor.count();
-            assert!((at_least..at_most).contains(&floor), "{length}: {floor}");
+            assert!((at_least..810).contains(&floor), "{length}: {floor}");
         }
     }
 }
