@@ -5,11 +5,13 @@
 //! away those that crowd others. Going on with it orders what is left, so that every prefix of the
 //! points is an even, coarser set.
 
+mod cover;
 mod eliminate;
 pub mod pilot;
 
 use crate::lattice::Lattice;
 use crate::scene::Mesh;
+use cover::cover;
 use eliminate::{Sample, eliminate};
 use glam::{DVec3, Vec3};
 use pilot::Density;
@@ -21,7 +23,8 @@ use std::fmt;
 /// root mean square; two random ones 0.85), in a third of the time.
 const CANDIDATES_PER_POINT: f64 = 2.0;
 
-/// Most points of one mesh. Making them takes about 100 bytes a candidate: up to 3.4 GB.
+/// Most points of one mesh. Making them takes about 100 bytes a candidate: up to 3.4 GB, and twice
+/// that where all is thin.
 pub const MAX_POINTS: u64 = 1 << 24;
 
 /// A sample on a mesh's surface: where it is never changes; its position and normal follow from
@@ -234,6 +237,13 @@ pub fn generate_with(
         let back = candidates.iter().find(|c| c.back);
         let points = front.into_iter().chain(back).copied().collect();
         return Ok(PointSet { points, area_m2 });
+    }
+    let strewn = candidates.len();
+    let radius = largest_radius(density);
+    cover(mesh, metric, radius, sides, count / 4, &mut candidates);
+    if let Some(factors) = factors {
+        let added = candidates[strewn..].iter().map(|c| factors.at(mesh, c));
+        of_candidates.extend(added);
     }
     if let Some(lattice) = lattice {
         // Before elimination, which evens out what this does to their distances.

@@ -50,16 +50,18 @@ pub struct Level {
 
 impl PointSet {
     /// Patches of a mesh's points, which come in progressive order; `grid` is that of level 0,
-    /// around all of them, and `highest` the last level. `None` if there are no points.
+    /// around all of them, `highest` the last level, and `room` how many points a cell keeps. `None`
+    /// if there are no points.
     pub fn new(
         mesh: &Mesh,
         points: &[SurfacePoint],
         grid: &Instance,
         highest: u32,
+        room: usize,
     ) -> Option<PointSet> {
         let place = |point| lattice::place(mesh, grid, point);
         let mut places: Vec<Option<Placement>> = points.iter().map(place).collect();
-        leave_room(&mut places);
+        leave_room(&mut places, room);
         let coded = |(index, point): (usize, &SurfacePoint)| {
             let at = places[index]?;
             let mut coded = PatchPoint {
@@ -151,13 +153,13 @@ impl PointSet {
 /// Drops what a cell has no room for. The first points of the progressive order stay: they are
 /// spread well over all that the cell holds, such as both sides of a thin wall, which those that
 /// a client happens to get first need not be.
-fn leave_room(places: &mut [Option<Placement>]) {
+fn leave_room(places: &mut [Option<Placement>], room: usize) {
     let mut loads: HashMap<[u32; 3], usize, Fast> = HashMap::default();
     for place in places {
         let Some(at) = place else { continue };
         let load = loads.entry(at.cell).or_default();
         *load += 1;
-        if *load > CELL_POINTS {
+        if *load > room {
             *place = None;
         }
     }
@@ -285,10 +287,10 @@ impl Adjacency {
 pub const SLICE_BLOCKS: usize = PATCH_POINTS / BLOCK;
 
 /// Hashes of cells: their coordinates are no attacker's.
-type Fast = BuildHasherDefault<CellHasher>;
+pub(crate) type Fast = BuildHasherDefault<CellHasher>;
 
 #[derive(Default)]
-struct CellHasher(u64);
+pub(crate) struct CellHasher(u64);
 
 impl Hasher for CellHasher {
     fn finish(&self) -> u64 {

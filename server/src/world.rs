@@ -24,6 +24,7 @@ use place::{
     Placed, Sampled, distinct_cells, extent, place_instances, place_points, shared_points,
     try_places,
 };
+use psao_core::cell::CELL_POINTS;
 use psao_core::residual::BLOCK;
 use psao_core::topology::LEVELS;
 use psao_core::{Instance, Kernel};
@@ -59,6 +60,9 @@ pub struct Options {
     pub radius_over_rm: f32,
     /// Cell size c over r.
     pub cell_over_radius: f32,
+    /// In rest space, points that a cell has room for; those that find none are dropped.
+    /// [`CELL_POINTS`], but where points are tried that go into no stream.
+    pub cell_capacity: usize,
     /// Points lie denser where occlusion changes fast, and less dense elsewhere: as many in all.
     pub adaptive: bool,
     /// Seed of the point placement.
@@ -89,6 +93,7 @@ impl Options {
             kernel,
             radius_over_rm,
             cell_over_radius,
+            cell_capacity: CELL_POINTS,
             adaptive: false,
             seed: 1,
             rest_space: false,
@@ -380,7 +385,8 @@ impl World {
                 let all = self.options.levels.then_some(LEVELS - 1);
                 let highest = asked.chain(all).max().unwrap_or(0);
                 let mesh = &self.scene.meshes[sampled.mesh as usize];
-                let set = PointSet::new(mesh, &sampled.points, &sampled.grid?, highest);
+                let room = self.options.cell_capacity;
+                let set = PointSet::new(mesh, &sampled.points, &sampled.grid?, highest, room);
                 let so_far = done.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
                 progress("topology", so_far + 1, total);
                 set
@@ -1865,7 +1871,8 @@ pub fn scale_of(world_from_local: &Affine3A) -> Vec3 {
     Vec3::new(m.x_axis.length(), m.y_axis.length(), m.z_axis.length())
 }
 
-fn bounds_of(positions: impl Iterator<Item = Vec3>) -> [Vec3; 2] {
+/// The box around positions.
+pub fn bounds_of(positions: impl Iterator<Item = Vec3>) -> [Vec3; 2] {
     positions.fold([Vec3::INFINITY, Vec3::NEG_INFINITY], |[min, max], p| {
         [min.min(p), max.max(p)]
     })

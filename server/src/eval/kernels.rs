@@ -1,9 +1,10 @@
 //! `psao eval --kernels …`: how well each kernel, cell size, capacity and placement rebuilds the
 //! occlusion of a picture from the same number of points, what it reads and how long it takes.
 //!
-//! The points are those that the server places and traces. They go into grids that are made for
-//! each variant here, so that capacities and kernels can be tried which no stream has. Pictures
-//! are ray traced once and shared by all variants.
+//! The points are those of profile `residual`: where a client has them, and as traced. They go into
+//! grids that are made for each variant here, so that capacities and kernels can be tried which no
+//! stream has; the default's is the stream's own. Pictures are ray traced once and shared by all
+//! variants.
 
 use super::convergence::{self, Convergence};
 use super::variants::{
@@ -17,10 +18,11 @@ use crate::picture::{Picture, write_whole};
 use crate::render::{Fragment, REFERENCE_RAYS, View};
 use crate::report::{Form, Panel, Plot, Report};
 use crate::samples::Samples;
-use crate::world::{Options, Progress, World, scale_of};
-use glam::Vec3;
+use crate::world::{Options, Progress, World, bounds_of};
+use glam::{DVec3, Vec3};
 use psao_core::Kernel;
 use psao_core::cell::CELL_POINTS;
+use psao_core::point::NORMALS;
 use rayon::prelude::*;
 use serde::Serialize;
 use std::collections::HashSet;
@@ -199,9 +201,10 @@ pub fn run(args: &EvalArgs, progress: Progress<'_>) -> Result<Found, String> {
         for &placement in &args.placements {
             let options = Options {
                 rest_space: true,
+                // Which points cells drop that overflow follows from these.
                 levels: true,
-                // Cells so small that none overflows: what does is each variant's own affair.
-                cell_over_radius: 0.5,
+                // What overflows is each variant's own affair.
+                cell_capacity: usize::MAX,
                 adaptive: placement == PlacementArg::Adaptive,
                 ..scene.options()?
             };
@@ -293,31 +296,38 @@ fn points_of(world: &mut World, shot: &Shot, progress: Progress<'_>) -> Vec<SetS
     let world = &*world;
     let instances = 0..world.scene.instances.len() as u32;
     let sets = instances.into_par_iter().filter_map(|instance| {
-        let slices = &world.slices[{
-            let range = world.slices_of(instance);
-            range.start as usize..range.end as usize
-        }];
+        let (set, level) = (world.topology.set_of(instance)?, world.level_of(instance)?);
+        let placed = &set.levels[0].grid;
+        let unit = 1.0 / Vec3::from(placed.cells_per_unit).as_dvec3();
+        let slices = world.slices_of(instance);
+        let slices = world.slices[slices.start as usize..slices.end as usize].iter();
         let points: Vec<Sample> = slices
-            .iter()
             .filter(|slice| seen(slice.bounds))
             .flat_map(|slice| {
-                let numbers = slice.points.clone().zip(world.occlusion(slice));
-                numbers
-                    .zip(world.levels(slice))
-                    .map(|((number, &occlusion), &level)| {
-                        let (position, normal) = world.grid_point(instance, number);
+                let points = world.topology.points_of(slice.patch, level);
+                points
+                    .zip(world.occlusion(slice))
+                    .map(|(point, &occlusion)| {
+                        let cells =
+                            DVec3::from(point.position.map(|s| (f64::from(s) + 0.5) / 32.0));
+                        let normal = Vec3::from(NORMALS[point.normal as usize]);
                         Sample {
-                            position,
-                            normal,
+                            position: (Vec3::from(placed.origin).as_dvec3() + cells * unit)
+                                .as_vec3(),
+                            normal: (normal / Vec3::from(placed.normal_scale)).normalize_or_zero(),
                             occlusion,
-                            level,
+                            level: point.level,
                         }
                     })
             })
             .collect();
+        let mesh = &world.scene.meshes[world.scene.instances[instance as usize].mesh as usize];
+        let corners = mesh.triangles.iter().flatten();
+        let own = &set.levels[level as usize].grid;
         (!points.is_empty()).then(|| SetSamples {
             instance,
-            scale: scale_of(&world.pose.instances[instance as usize].world_from_local),
+            scale: Vec3::from(own.cells_per_unit) * world.options.cell_m(),
+            bounds: bounds_of(corners.map(|i| mesh.positions[*i as usize])),
             points,
         })
     });

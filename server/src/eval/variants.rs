@@ -9,7 +9,7 @@ use psao_core::{Bucket, Instance, Lookup, Point};
 use rayon::prelude::*;
 use std::collections::HashMap;
 
-/// A point as it was placed and traced.
+/// A point where a client has it, as it was traced.
 #[derive(Clone, Copy, Debug)]
 pub struct Sample {
     /// In the space of its instance's grid.
@@ -29,6 +29,8 @@ pub struct Samples {
     pub instance: u32,
     /// Metres a unit of the grid's space, an axis.
     pub scale: Vec3,
+    /// What its grid is around, in that space.
+    pub bounds: [Vec3; 2],
     /// In the order in which they go into cells.
     pub points: Vec<Sample>,
 }
@@ -224,13 +226,7 @@ fn fill<const N: usize>(
     cell_over_radius: f32,
     capacity: usize,
 ) -> Option<Filled<N>> {
-    let bounds = set
-        .points
-        .iter()
-        .fold([Vec3::INFINITY, Vec3::NEG_INFINITY], |[min, max], point| {
-            [min.min(point.position), max.max(point.position)]
-        });
-    let mut grid = fit(bounds, set.scale, cell_m, 1.0 / cell_over_radius)?;
+    let mut grid = fit(set.bounds, set.scale, cell_m, 1.0 / cell_over_radius)?;
     let mut index: HashMap<[u32; 3], usize> = HashMap::new();
     let mut cells: Vec<([u32; 3], Cell<N>)> = Vec::new();
     let mut discarded = 0;
@@ -570,6 +566,7 @@ mod tests {
         let set = Samples {
             instance: 0,
             scale: Vec3::ONE,
+            bounds: [Vec3::ZERO, Vec3::ONE],
             points,
         };
         let grids = Grids::<7>::new(1, &[set], 0.07, 1.25, 7);
