@@ -14,7 +14,7 @@ use psao_core::residual::BLOCK;
 pub const AWAY: f32 = -0.3;
 
 /// How far the eye may have moved before the next frame with what it sees then has come, metres.
-const EYE_M: f32 = 0.1;
+pub const EYE_M: f32 = 0.1;
 
 /// Where a block of points is, and which way its normals point.
 #[derive(Clone, Copy, Debug, Default)]
@@ -75,11 +75,12 @@ impl Cone {
         }
     }
 
-    /// The cones of points' blocks. Of each point: its position, and two unit normals (the same
-    /// where it has one) that both have to face away before it does.
-    pub fn of_blocks(points: impl Iterator<Item = (Vec3, [Vec3; 2])>) -> Vec<Cone> {
+    /// The cones of points' blocks, and of all of them. Of each point: its position, and two unit
+    /// normals (the same where it has one) that both have to face away before it does.
+    pub fn of_blocks(points: impl Iterator<Item = (Vec3, [Vec3; 2])>) -> (Vec<Cone>, Cone) {
         let points: Vec<(Vec3, [Vec3; 2])> = points.collect();
-        points.chunks(BLOCK).map(Cone::of).collect()
+        let blocks = points.chunks(BLOCK).map(Cone::of).collect();
+        (blocks, Cone::of(&points))
     }
 
     /// Whether all of its points face an eye, and whether any does that is at most `around` from
@@ -114,7 +115,7 @@ impl Cone {
     }
 }
 
-/// An eye in an instance's local space.
+/// An eye in an instance's local space, wherever it is within a distance.
 #[derive(Clone, Copy, Debug)]
 pub struct LocalEye {
     position: Vec3,
@@ -122,9 +123,9 @@ pub struct LocalEye {
 }
 
 impl LocalEye {
-    /// `None` where angles in local space are not those in the world (the instance is stretched),
-    /// or not known.
-    pub fn of(eye: Vec3, world_from_local: &Affine3A) -> Option<LocalEye> {
+    /// Of an eye that may be `around_m` metres from where it is said to be. `None` where angles in
+    /// local space are not those in the world (the instance is stretched), or not known.
+    pub fn of(eye: Vec3, around_m: f32, world_from_local: &Affine3A) -> Option<LocalEye> {
         let m = world_from_local.matrix3;
         let squared = m.transpose() * m;
         let scale = squared.x_axis.x;
@@ -133,7 +134,7 @@ impl LocalEye {
             .max(off(squared.y_axis, Vec3A::Y))
             .max(off(squared.z_axis, Vec3A::Z));
         let position = world_from_local.inverse().transform_point3(eye);
-        let around = EYE_M / scale.sqrt();
+        let around = around_m / scale.sqrt();
         let usable = stretched <= 0.02 * scale && around.is_finite() && position.is_finite();
         usable.then_some(LocalEye { position, around })
     }
@@ -147,6 +148,12 @@ impl LocalEye {
             faces.all = faces.all << 1 | u64::from(all);
         }
         faces
+    }
+
+    /// Whether any of some points may face it, given by their cone.
+    pub fn may_be_faced(&self, cone: &Cone) -> bool {
+        let [_, any] = cone.faces(self.position, self.around);
+        any
     }
 
     /// Whether a point may face it, or will soon.
@@ -185,7 +192,7 @@ mod tests {
         for seed in 0..4000 {
             let wide = [0.0, 0.2, 0.5, 2.0][seed as usize % 4];
             let points = piece(seed, Vec3::new(0.3, -0.2, 0.1), 0.2, wide);
-            let cone = Cone::of_blocks(points.iter().map(|&(at, normal)| (at, [normal; 2])))[0];
+            let cone = Cone::of_blocks(points.iter().map(|&(at, normal)| (at, [normal; 2]))).1;
             let angle = seed as f32;
             let eye = Vec3::new(angle.cos(), angle.sin(), (angle * 0.7).sin()) * 2.0;
             let faces = points.iter().any(|(at, normal)| {
@@ -211,17 +218,17 @@ mod tests {
     #[test]
     fn a_block_whose_normals_point_everywhere_and_an_eye_within_always_face() {
         let everywhere = [(Vec3::ZERO, [Vec3::X, Vec3::NEG_X])];
-        let cone = Cone::of_blocks(everywhere.into_iter())[0];
+        let cone = Cone::of_blocks(everywhere.into_iter()).1;
         assert_eq!(cone.faces(Vec3::splat(9.0), 0.0), [false, true]);
         let flat = [Vec3::X, Vec3::NEG_X].map(|at| (at, [Vec3::Y; 2]));
-        let cone = Cone::of_blocks(flat.into_iter())[0];
+        let cone = Cone::of_blocks(flat.into_iter()).1;
         assert!(cone.faces(Vec3::new(0.0, -0.5, 0.0), 0.0)[1]);
         assert!(!cone.faces(Vec3::new(0.0, -4.0, 0.0), 0.0)[1]);
     }
 
     #[test]
     fn an_instance_that_is_turned_moved_and_scaled_faces_as_it_does_in_the_world() {
-        let flat = Cone::of_blocks([(Vec3::ZERO, [Vec3::Y; 2])].into_iter());
+        let (flat, whole) = Cone::of_blocks([(Vec3::ZERO, [Vec3::Y; 2])].into_iter());
         let turned = Quat::from_rotation_z(std::f32::consts::FRAC_PI_2);
         let place = |scale: Vec3| {
             Affine3A::from_scale_rotation_translation(scale, turned, Vec3::new(5.0, 0.0, 0.0))
@@ -229,12 +236,17 @@ mod tests {
         // It looks along -x now.
         for (x, sees) in [(2.0, 1), (8.0, 0)] {
             let eye = Vec3::new(x, 0.0, 0.0);
-            let local = LocalEye::of(eye, &place(Vec3::splat(0.25))).expect("not stretched");
+            let local = LocalEye::of(eye, EYE_M, &place(Vec3::splat(0.25)));
+            let local = local.expect("not stretched");
             assert_eq!(local.faces(&flat).any, sees);
             assert_eq!(local.is_faced(Vec3::ZERO, Vec3::Y), sees == 1);
-            assert!(LocalEye::of(eye, &place(Vec3::new(1.0, 2.0, 1.0))).is_none());
-            assert!(LocalEye::of(eye, &place(Vec3::ZERO)).is_none());
+            assert_eq!(local.may_be_faced(&whole), sees == 1);
+            // From where it looks at it, and from where it does not, if that is near enough.
+            let near = LocalEye::of(eye, 4.0, &place(Vec3::splat(0.25)));
+            assert!(near.expect("not stretched").may_be_faced(&whole));
+            assert!(LocalEye::of(eye, EYE_M, &place(Vec3::new(1.0, 2.0, 1.0))).is_none());
+            assert!(LocalEye::of(eye, EYE_M, &place(Vec3::ZERO)).is_none());
         }
-        assert!(LocalEye::of(Vec3::splat(f32::INFINITY), &place(Vec3::ONE)).is_none());
+        assert!(LocalEye::of(Vec3::splat(f32::INFINITY), EYE_M, &place(Vec3::ONE)).is_none());
     }
 }

@@ -9,7 +9,7 @@ mod between;
 mod place;
 mod turns;
 
-use crate::facing::{Cone, Faces, LocalEye};
+use crate::facing::{Cone, EYE_M, Faces, LocalEye};
 use crate::points::{PointError, SurfacePoint, largest_radius};
 use crate::rays::{
     Against, CpuTracer, Deformed, Fan, FanTracer, TooManyTriangles, Tracer, offset_origin, reach,
@@ -190,6 +190,15 @@ struct Carrier {
     unplaced: bool,
 }
 
+/// Which way an instance's points face, in local space.
+#[derive(Clone, Debug, Default)]
+struct Cones {
+    /// Block by block: a slice's at [`SLICE_BLOCKS`] times its patch's number in its set.
+    blocks: Vec<Cone>,
+    /// Slice by slice.
+    slices: Vec<Cone>,
+}
+
 /// What one step did.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct StepStats {
@@ -250,9 +259,8 @@ pub struct World {
     /// In rest space, of each slice the blocks in which a point's occlusion has changed since
     /// [`World::clear_changes`].
     changed: Vec<u64>,
-    /// In rest space, which way each instance's points face, block by block, in local space: a
-    /// slice's at [`SLICE_BLOCKS`] times its patch's number in its set.
-    cones: Vec<Arc<Vec<Cone>>>,
+    /// In rest space, which way each instance's points face.
+    cones: Vec<Arc<Cones>>,
     openness: Vec<Option<Openness>>,
     /// Rays against what each point is attached to: bits of those that hit.
     fixed: Vec<u64>,
@@ -769,12 +777,12 @@ impl World {
             }
         }
         let reach = self.options.ao_distance_m;
-        for slice in &mut self.slices {
+        self.slices.par_iter_mut().for_each(|slice| {
             slice.stale |= swept.iter().any(|(instance, hulls)| {
                 let near = |hull: &Hull| hull.is_near(slice.bounds, reach);
                 *instance != slice.instance && hulls.iter().any(near)
             });
-        }
+        });
     }
 
     /// Where a finer level is wanted than at the last step, its points may have missed something.
@@ -893,8 +901,11 @@ impl World {
         // Slices with something to do, and the rays that their points are to have had.
         let mut asked: Vec<(usize, usize)> = Vec::new();
         let mut budget = converge_rays;
-        for (index, (slice, turn)) in self.slices.iter().zip(&mut self.turns).enumerate() {
-            if !visible(slice.bounds) || self.absent.contains(&slice.instance) {
+        let of_slices = self.slices.par_iter();
+        let is_visible: Vec<bool> = of_slices.map(|slice| visible(slice.bounds)).collect();
+        let slices = self.slices.iter().zip(&mut self.turns).zip(is_visible);
+        for (index, ((slice, turn), is_visible)) in slices.enumerate() {
+            if !is_visible || self.absent.contains(&slice.instance) {
                 continue;
             }
             turn.is_new = turn.seen_at + 1 < self.steps;
@@ -1387,14 +1398,15 @@ impl World {
             let position = point.position(triangles, positions);
             let position = pose.world_from_local.transform_point3(position);
             let outward = pose.world_normal(point.geometric_normal(triangles, positions));
-            let facing = pose.world_normal(point.normal(triangles, positions, normals));
             let origin = offset_origin(position, outward, reach);
             // Every other time from where it may be soon.
             let mut aside = || ((next() >> 8) as f32 / (1 << 23) as f32 - 1.0) * LOOKAHEAD_M;
             let aside = Vec3::new(aside(), aside(), aside());
             let eye = if sample % 2 == 0 { eye } else { eye + aside };
             let (direction, far) = (eye - origin).normalize_and_length();
-            if direction.dot(facing).max(direction.dot(outward)) <= 0.0 {
+            // The triangle says it nearly always, and is at hand already.
+            let facing = || pose.world_normal(point.normal(triangles, positions, normals));
+            if direction.dot(outward) <= 0.0 && direction.dot(facing()) <= 0.0 {
                 return false;
             }
             let mut hit = [0];
@@ -1474,25 +1486,51 @@ impl World {
     }
 
     fn local_eye(&self, instance: u32, eye: Vec3) -> Option<LocalEye> {
-        LocalEye::of(
-            eye,
-            &self.pose.instances[instance as usize].world_from_local,
-        )
+        let place = &self.pose.instances[instance as usize].world_from_local;
+        LocalEye::of(eye, EYE_M, place)
+    }
+
+    /// For [`World::may_be_seen`]: an eye that may soon be anywhere around, as each instance has it.
+    pub fn local_eyes(&self, eye: Vec3) -> Vec<Option<LocalEye>> {
+        // To the corners of where `is_seen` looks from.
+        let around_m = LOOKAHEAD_M * 3f32.sqrt();
+        let poses = self.pose.instances.iter();
+        let eyes = poses.map(|pose| LocalEye::of(eye, around_m, &pose.world_from_local));
+        eyes.collect()
+    }
+
+    /// Whether a point of a slice may face one of [`World::local_eyes`]: where none does,
+    /// [`World::is_seen`] finds none.
+    pub fn may_be_seen(&self, slice: &Slice, eyes: &[Option<LocalEye>]) -> bool {
+        let instance = slice.instance as usize;
+        let (Some(eye), Some(cones)) = (&eyes[instance], self.cones.get(instance)) else {
+            return true;
+        };
+        let cone = cones.slices.get(self.patch_in_set(slice));
+        cone.is_none_or(|cone| eye.may_be_faced(cone))
+    }
+
+    /// In rest space: the number of a slice's patch in its set; 0 without one.
+    fn patch_in_set(&self, slice: &Slice) -> usize {
+        let own = self.topology.of_instance.get(slice.instance as usize);
+        let set = own.copied().flatten();
+        set.map_or(0, |(set, _)| {
+            slice.patch - self.topology.first_patch[set as usize]
+        }) as usize
     }
 
     /// A slice's part of [`World::cones`].
     fn cones_at(&self, slice: &Slice) -> Option<&[Cone]> {
         let cones = self.cones.get(slice.instance as usize)?;
-        let (set, _) = self.topology.of_instance[slice.instance as usize]?;
-        let patch = slice.patch - self.topology.first_patch[set as usize];
-        let first = patch as usize * SLICE_BLOCKS;
-        cones.get(first..first + slice.points.len().div_ceil(BLOCK))
+        let first = self.patch_in_set(slice) * SLICE_BLOCKS;
+        let blocks = slice.points.len().div_ceil(BLOCK);
+        cones.blocks.get(first..first + blocks)
     }
 
     /// What [`World::facing`] asks, in the present pose; one for all instances that do not deform
     /// and have the same points.
-    fn all_cones(&self) -> Vec<Arc<Vec<Cone>>> {
-        let mut shared: BTreeMap<(u32, u32), Arc<Vec<Cone>>> = BTreeMap::new();
+    fn all_cones(&self) -> Vec<Arc<Cones>> {
+        let mut shared: BTreeMap<(u32, u32), Arc<Cones>> = BTreeMap::new();
         let of_instance = self.topology.of_instance.iter().zip(0..);
         of_instance
             .map(|(key, instance)| {
@@ -1508,21 +1546,24 @@ impl World {
             .collect()
     }
 
-    fn cones_of(&self, instance: u32) -> Vec<Cone> {
+    fn cones_of(&self, instance: u32) -> Cones {
         let (positions, normals) = self.vertices(instance);
         let triangles = &self.mesh(instance).triangles;
         let slices = self.slices_of(instance);
         let slices = self.slices[slices.start as usize..slices.end as usize].par_iter();
-        slices
-            .flat_map_iter(|slice| {
-                let points = slice.points.start as usize..slice.points.end as usize;
-                let points = self.points[points].iter();
-                let points = points.map(|p| sides(p, triangles, positions, normals));
-                let mut cones = Cone::of_blocks(points);
-                cones.resize(SLICE_BLOCKS, Cone::default());
-                cones
-            })
-            .collect()
+        let of_slice = |slice: &Slice| {
+            let points = slice.points.start as usize..slice.points.end as usize;
+            let points = self.points[points].iter();
+            Cone::of_blocks(points.map(|p| sides(p, triangles, positions, normals)))
+        };
+        let of_slices: Vec<(Vec<Cone>, Cone)> = slices.map(of_slice).collect();
+        let mut cones = Cones::default();
+        for (mut blocks, slice) in of_slices {
+            blocks.resize(SLICE_BLOCKS, Cone::default());
+            cones.blocks.append(&mut blocks);
+            cones.slices.push(slice);
+        }
+        cones
     }
 
     /// Starts a new frame for [`World::changed`] and [`Truth::changes`].
@@ -1538,9 +1579,7 @@ impl World {
         let Some(openness) = &self.openness[slice.instance as usize] else {
             return 0;
         };
-        let set = self.topology.of_instance[slice.instance as usize].map_or(0, |(set, _)| set);
-        let patch = slice.patch - self.topology.first_patch[set as usize];
-        let first = patch as usize * SLICE_BLOCKS;
+        let first = self.patch_in_set(slice) * SLICE_BLOCKS;
         let near = openness.near_dark[first..first + SLICE_BLOCKS].iter();
         near.rev()
             .fold(0, |shown, &dark| shown << 1 | u64::from(dark > 0))
@@ -1549,14 +1588,13 @@ impl World {
     fn note_change(&mut self, index: usize, blocks: u64) {
         self.changed[index] |= blocks;
         let slice = &self.slices[index];
-        let set = self.topology.of_instance[slice.instance as usize].map_or(0, |(set, _)| set);
-        let patch = slice.patch - self.topology.first_patch[set as usize];
+        let first_block = self.patch_in_set(slice) * SLICE_BLOCKS;
         let points = slice.points.start as usize..slice.points.end as usize;
         let Some(openness) = &mut self.openness[slice.instance as usize] else {
             return;
         };
         let blocks = self.occlusion[points].chunks(BLOCK);
-        for (block, occlusion) in (patch as usize * SLICE_BLOCKS..).zip(blocks) {
+        for (block, occlusion) in (first_block..).zip(blocks) {
             let least = occlusion.iter().copied().min().unwrap_or(255);
             openness.set(block, least);
         }

@@ -2,7 +2,7 @@
 
 use super::{Eye, View};
 use crate::render::{Fragment, first_visible};
-use crate::world::World;
+use crate::world::{Slice, World};
 use rayon::prelude::*;
 use std::ops::RangeBounds;
 
@@ -12,15 +12,25 @@ use std::ops::RangeBounds;
 const LOOKS: usize = 16;
 const NEW_LOOKS: u8 = 64;
 
-/// Rays that a frame spends so on slices that came into the frustum a short while ago, and on the
-/// others: however many there are, all have their turn. (A slice is the smaller the denser points
-/// are: as many rays then find as much.) What has come with this very frame is looked for at once,
-/// all of it, so that a new view is whole in its first frame.
-const NEW_RAYS: usize = 4096;
-const RAYS: usize = 1024;
+/// Rays that a frame spends so on slices that came into view a short while ago, and on the others:
+/// however many there are, all have their turn. (A slice is the smaller the denser points are: as
+/// many rays then find as much.) What has come with this very frame is looked for at once, all of
+/// it, so that a new view is whole in its first frame.
+const NEW_RAYS: usize = 3072;
+const RAYS: usize = 768;
 
-/// Rays through the picture that a frame casts, across and down, as long as slices in the frustum
-/// have not been in sight: what shows between two columns is found the sooner the more of the
+/// As many, where nobody knows which slices face away (profile `cells`), with the looks at those:
+/// they cast no ray.
+fn with_away(world: &World, rays: usize) -> usize {
+    if world.options.rest_space {
+        rays
+    } else {
+        rays + rays / 3
+    }
+}
+
+/// Rays through the picture that a frame casts, across and down, as long as slices in view have
+/// not been in sight: what shows between two columns is found the sooner the more of the
 /// picture it fills.
 const PICTURE_LOOKS: [u32; 2] = [24, 14];
 
@@ -29,17 +39,20 @@ const PICTURE_LOOKS: [u32; 2] = [24, 14];
 const NEW_PICTURE: u32 = 6;
 
 /// What has been in a client's view so far.
+///
+/// A slice is in view while it is in the frustum, its instance in the scene, and not all of its
+/// points face away from the eye and from wherever it may be soon.
 pub struct Sight {
     frames: u64,
-    /// The frame in which each slice was last in the frustum, with its instance in the scene.
+    /// The frame in which each slice was last in view.
     seen: Vec<u64>,
-    /// Slices of which something was in sight, not only in the frustum.
+    /// Slices of which something was in sight, not only in view.
     sighted: Vec<bool>,
-    /// Points of each slice that were looked for since it came into the frustum.
+    /// Points of each slice that were looked for since it came into view.
     looked: Vec<u8>,
-    /// Slices in the frustum that had not been in sight when the last frame began.
+    /// Slices in view that had not been in sight when the last frame began.
     hidden: Vec<u32>,
-    /// Slices in the frustum that have been in sight, in order.
+    /// Slices in view that have been in sight, in order.
     needed: Vec<u32>,
 }
 
@@ -60,10 +73,16 @@ impl Sight {
     pub fn look(&mut self, world: &World, view: &View<'_>) {
         self.frames += 1;
         let frames = self.frames;
+        let eyes = view.eye.map(|eye| world.local_eyes(eye.camera.position));
+        let may_face = |slice: &Slice| {
+            let eyes = eyes.as_ref();
+            eyes.is_none_or(|eyes| world.may_be_seen(slice, eyes))
+        };
         let marks = self.seen.par_iter_mut().zip(&mut self.looked);
         let slices = world.slices.par_iter().zip(marks);
         slices.for_each(|(slice, (seen, looked))| {
-            if (view.sees)(slice.bounds) && world.is_present(slice.instance) {
+            let present = world.is_present(slice.instance);
+            if present && (view.sees)(slice.bounds) && may_face(slice) {
                 if *seen + 1 < frames {
                     *looked = 0;
                 }
@@ -86,7 +105,7 @@ impl Sight {
         self.needed.extend(needed.map(|(_, index)| index));
     }
 
-    /// Looks for slices in the frustum that have not been in sight.
+    /// Looks for slices in view that have not been in sight.
     fn find(&mut self, world: &World, view: &View<'_>) {
         let Some(eye) = view.eye else {
             for slice in self.hidden.drain(..) {
@@ -99,8 +118,8 @@ impl Sight {
             self.hidden_after(NEW_LOOKS..),
         );
         // One in so many has its turn.
-        let new_turn = (new * LOOKS).div_ceil(NEW_RAYS) as u64;
-        let turn = (others * LOOKS).div_ceil(RAYS) as u64;
+        let new_turn = (new * LOOKS).div_ceil(with_away(world, NEW_RAYS)) as u64;
+        let turn = (others * LOOKS).div_ceil(with_away(world, RAYS)) as u64;
         let frames = self.frames;
         let looked_for = |slice: u32| {
             let turn = match self.looked[slice as usize] {
@@ -126,7 +145,7 @@ impl Sight {
         }
     }
 
-    /// How many slices in the frustum have not been in sight after so many looks.
+    /// How many slices in view have not been in sight after so many looks.
     fn hidden_after(&self, looks: impl RangeBounds<u8>) -> usize {
         let looked = self.hidden.iter().map(|slice| self.looked[*slice as usize]);
         looked.filter(|looked| looks.contains(looked)).count()
@@ -134,7 +153,7 @@ impl Sight {
 
     /// Marks slices that the picture shows.
     fn look_through_picture(&mut self, world: &World, eye: &Eye) {
-        let much = self.hidden_after(..1) * LOOKS > NEW_RAYS;
+        let much = self.hidden_after(..1) * LOOKS > with_away(world, NEW_RAYS);
         let finer = if much { NEW_PICTURE } else { 1 };
         let [width, height] = PICTURE_LOOKS.map(|looks| looks * finer);
         let frame = self.frames as u32;
@@ -167,12 +186,12 @@ impl Sight {
         self.frames
     }
 
-    /// The frame in which a slice was last in the frustum.
+    /// The frame in which a slice was last in view.
     pub fn last_seen(&self, slice: u32) -> u64 {
         self.seen[slice as usize]
     }
 
-    /// The slices in the frustum that have been in sight, in order.
+    /// The slices in view that have been in sight, in order.
     pub fn needed(&self) -> &[u32] {
         &self.needed
     }
