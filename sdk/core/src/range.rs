@@ -115,6 +115,7 @@ impl<'a> Encoder<'a> {
     }
 
     /// Writes one decision that is a yes in `odds`/65536 of all cases; 1 to 65535.
+    #[inline(always)]
     pub fn decide(&mut self, odds: u16, yes: bool) {
         let bound = (self.range >> 16).wrapping_mul(u64::from(odds));
         if yes {

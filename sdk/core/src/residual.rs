@@ -388,6 +388,12 @@ impl Side for Encode<'_> {
 
     #[inline(always)]
     fn coded(&mut self, row: &Row, way: i32, wanted: i32) -> i32 {
+        if wanted == 0 {
+            // The first symbol, and the usual one, is a decision.
+            let [none, ..] = *row;
+            self.coder.decide(none, true);
+            return 0;
+        }
         let along = wanted.wrapping_mul(way);
         let size = along.unsigned_abs();
         let against = u32::from(along < 0);
