@@ -787,6 +787,16 @@ fn a_camera_or_ack_that_was_overtaken_is_dropped() {
     raw.datagram(ack(0, 9));
     raw.datagram(at(3, 5.0));
     assert_eq!(server.message(id), OwnedMessage::Camera(camera(5.0)));
+    // A camera that stood still while sequences went around is newer all the same.
+    for (sequence, frame) in [(30_000, 11), (60_000, 12), (24_000, 13)] {
+        raw.datagram(ack(sequence, frame));
+        assert_eq!(server.message(id), OwnedMessage::Ack(frame));
+    }
+    raw.datagram(at(24_001, 6.0));
+    assert_eq!(server.message(id), OwnedMessage::Camera(camera(6.0)));
+    raw.datagram(at(24_000, 7.0));
+    raw.datagram(ack(24_002, 14));
+    assert_eq!(server.message(id), OwnedMessage::Ack(14));
     assert_eq!(server.events, []);
 }
 

@@ -673,11 +673,15 @@ async fn read_messages(
 /// Cameras and acknowledgements. What was overtaken on the way is dropped.
 async fn read_datagrams(connection: quinn::Connection, shared: Arc<Shared>, id: ClientId) {
     let (mut last_camera, mut last_ack) = (None, None);
-    // Sequences wrap.
-    let newer = |sequence: u16, last: &mut Option<u16>| {
-        let newer = last.is_none_or(|last| sequence.wrapping_sub(last) as i16 > 0);
+    // Sequences wrap, and a kind may be silent for longer than that takes: a camera that stands
+    // still. So they are told by the newest of both kinds.
+    let mut newest = 0i64;
+    let mut newer = |sequence: u16, last: &mut Option<i64>| {
+        let number = newest + i64::from(sequence.wrapping_sub(newest as u16) as i16);
+        newest = newest.max(number);
+        let newer = last.is_none_or(|last| number > last);
         if newer {
-            *last = Some(sequence);
+            *last = Some(number);
         }
         newer
     };
