@@ -1269,9 +1269,11 @@ fn decode(data: &[u8], opens: bool, step: i64, slice: &mut Slice) -> Result<(), 
         })
         .collect();
     let (mut moved_before, mut moved_before_that) = (0, 0);
+    let mut coded = vec![false; points.len()];
     for start in (0..points.len()).step_by(16) {
         let block = start..(start + 16).min(points.len());
         let changed = block.clone().filter(|&at| points[at].last != 0).count();
+        let rests = changed == 0;
         let column = match changed {
             0..=2 => changed,
             3..=5 => 3,
@@ -1296,7 +1298,16 @@ fn decode(data: &[u8], opens: bool, step: i64, slice: &mut Slice) -> Result<(), 
             }
             continue;
         }
+        coded[block.clone()].fill(true);
         for at in block {
+            let nearby = slice.earlier[at].iter().copied();
+            let mut around: Vec<i64> = nearby
+                .filter(|&other| coded[other])
+                .map(|other| points[other].last)
+                .collect();
+            if around.is_empty() && at > start {
+                around.push(points[at - 1].last);
+            }
             let or_itself = |found: &[usize]| [0, 1].map(|i| *found.get(i).unwrap_or(&at));
             let point = &mut points[at];
             let earlier = or_itself(&slice.earlier[at]);
@@ -1316,7 +1327,15 @@ fn decode(data: &[u8], opens: bool, step: i64, slice: &mut Slice) -> Result<(), 
             }
             let later = or_itself(&slice.later[at]);
             let all = || earlier.iter().chain(&later);
-            let sum = all().map(|&other| moving[other].weight).sum::<i64>() + 7 * point.last;
+            let mut sum = all().map(|&other| moving[other].weight).sum::<i64>() + 7 * point.last;
+            let activity: i64 = all().map(|&other| moving[other].activity).sum();
+            let mut activity = activity + 2 * point.last.abs();
+            if let (true, Some((a, b))) = (rests, around.first().zip(around.last()))
+                && a.abs().max(b.abs()) >= 5
+            {
+                sum = 31 * (a + b);
+                activity = a.abs() + b.abs() + 4 * (a - b).abs();
+            }
             let change = (sum + 32).div_euclid(64);
             let predicted = (point.occlusion + change).clamp(0, 255);
             let (way, lies) = match predicted {
@@ -1327,8 +1346,6 @@ fn decode(data: &[u8], opens: bool, step: i64, slice: &mut Slice) -> Result<(), 
                     (way, usize::from((sum - 64 * change) * way >= 0))
                 }
             };
-            let activity: i64 = all().map(|&other| moving[other].activity).sum();
-            let activity = activity + 2 * point.last.abs();
             let starts = [1, 3, 5, 7, 10, 14, 20, 28, 40, 60, 91];
             let kind = starts.iter().filter(|start| **start <= activity).count();
             let row = 36 * of_step + 3 * kind + lies;
