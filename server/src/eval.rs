@@ -3,7 +3,8 @@
 //!
 //! All streams of a profile and rate are encoded and decoded side by side over the same steps of
 //! one world, so they differ in nothing but the quantiser. The two profiles need a world each (one
-//! in rest space), which trace the same rays along the same camera path.
+//! in rest space), which trace the same rays along the same camera path. How long decoding takes is
+//! measured afterwards, for the streams of both by turns.
 
 pub mod convergence;
 pub mod kernels;
@@ -43,6 +44,9 @@ const MARGIN_DEGREES: f32 = 10.0;
 
 /// Most memory that the streams measured side by side may take, bytes.
 const MAX_STREAMS_BYTES: u64 = 16 << 30;
+
+/// How often each frame is decoded for its time.
+const DECODE_ROUNDS: usize = 5;
 
 /// Most values a list option takes: each multiplies the work.
 const MAX_VALUES: usize = 16;
@@ -184,7 +188,8 @@ pub struct Row {
     pub psnr_db: Option<f64>,
     /// Mean FLIP of the pictures; `null` if none shows the scene.
     pub flip: Option<f64>,
-    /// Median milliseconds that the client takes for a frame's bytes, on one thread.
+    /// Median milliseconds that the client takes for a frame's bytes, on one thread; of each frame the
+    /// median of several times.
     pub decode_ms: f64,
     /// 99th percentile of the same.
     pub decode_p99_ms: f64,
@@ -288,6 +293,7 @@ pub fn run(args: &EvalArgs, progress: Progress<'_>) -> Result<Evaluation, String
         args,
         samples: Samples::new(REFERENCE_RAYS),
         references: BTreeMap::new(),
+        recordings: Vec::new(),
     };
     let mut found = Evaluation {
         frames: args.frames,
@@ -307,9 +313,11 @@ pub fn run(args: &EvalArgs, progress: Progress<'_>) -> Result<Evaluation, String
         }
         for &rate_hz in &args.rates {
             for &points_per_pixel in &args.points_per_pixel {
+                bench.time_decoding(&mut found, rate_hz, points_per_pixel)?;
                 found.compare(density, rate_hz, points_per_pixel);
             }
         }
+        bench.recordings.clear();
     }
     if let Some(path) = &args.json {
         let json = serde_json::to_string_pretty(&found).map_err(|error| error.to_string())?;
@@ -328,6 +336,19 @@ struct Bench<'a> {
     samples: Samples,
     /// Ray-traced pictures by rate and frame: the same for every profile and density.
     references: BTreeMap<(u64, u32), Vec<f32>>,
+    /// Streams of the density at hand.
+    recordings: Vec<Recording>,
+}
+
+/// A stream, to be decoded again.
+struct Recording {
+    /// Into [`Evaluation::rows`].
+    row: usize,
+    config: Config,
+    /// Of each frame.
+    bytes: Vec<Vec<u8>>,
+    /// Its first steady frame.
+    steady: usize,
 }
 
 impl Bench<'_> {
@@ -459,7 +480,13 @@ impl Bench<'_> {
             report(u64::from(frame) + 1, u64::from(args.frames));
         }
         let steady = left_out(args.frames, rate_hz) as usize;
-        for stream in streams {
+        for mut stream in streams {
+            self.recordings.push(Recording {
+                row: found.rows.len(),
+                config: stream.config,
+                bytes: std::mem::take(&mut stream.sent),
+                steady,
+            });
             let cells = stream.encoder.cells(world);
             let steps = step_ms[steady..].iter();
             let frames = steps.zip(&stream.frames[steady..]);
@@ -481,6 +508,62 @@ impl Bench<'_> {
         }
         Ok(())
     }
+
+    /// Decodes the streams that are compared again, one frame of each by turns, so that whatever else
+    /// the machine does slows them alike. Between two frames of a stream come those of all others,
+    /// which leave little of it in caches, as an engine would.
+    fn time_decoding(
+        &self,
+        found: &mut Evaluation,
+        rate_hz: f64,
+        points_per_pixel: f32,
+    ) -> Result<(), String> {
+        let compared = |recording: &&Recording| {
+            let row = &found.rows[recording.row];
+            let thinned_alike = row.points_per_pixel == points_per_pixel;
+            row.rate_hz == rate_hz && (thinned_alike || row.profile == ProfileArg::Cells.name())
+        };
+        let recordings: Vec<&Recording> = self.recordings.iter().filter(compared).collect();
+        let mut times: Vec<Vec<Vec<f64>>> = recordings
+            .iter()
+            .map(|recording| vec![Vec::new(); recording.bytes.len()])
+            .collect();
+        for _ in 0..DECODE_ROUNDS {
+            let mut clients: Vec<Client> = recordings
+                .iter()
+                .map(|recording| Client::new(recording.config))
+                .collect();
+            for frame in 0..self.args.frames as usize {
+                for ((recording, client), times) in
+                    recordings.iter().zip(&mut clients).zip(&mut times)
+                {
+                    let start = Instant::now();
+                    push(client, &recording.bytes[frame])?;
+                    times[frame].push(ms(start));
+                    client.clear_dirty();
+                }
+            }
+        }
+        for (recording, times) in recordings.iter().zip(&times) {
+            let steady = times[recording.steady..].iter();
+            let decode: Vec<f64> = steady.map(|rounds| percentile(rounds, 0.5)).collect();
+            let row = &mut found.rows[recording.row];
+            row.decode_ms = percentile(&decode, 0.5);
+            row.decode_p99_ms = percentile(&decode, 0.99);
+        }
+        Ok(())
+    }
+}
+
+/// Gives a client all of a frame's bytes; returns the frame that it shows then.
+fn push(client: &mut Client, mut bytes: &[u8]) -> Result<Option<u32>, String> {
+    let mut shown = None;
+    while !bytes.is_empty() {
+        let pushed = client.push(bytes).map_err(|error| error.to_string())?;
+        bytes = &bytes[pushed.consumed..];
+        shown = pushed.frame.map(|frame| frame.id).or(shown);
+    }
+    Ok(shown)
 }
 
 impl EvalArgs {
@@ -531,11 +614,14 @@ fn bounded(world: &World, streams: usize) -> Result<(), String> {
 struct Stream {
     scheme: Scheme,
     encoder: Encoder,
+    config: Config,
     client: Client,
     /// The client's cells before the frame.
     before: Vec<Cell>,
     /// Bytes made and not pushed yet: before the first frame, the header.
     bytes: Vec<u8>,
+    /// Those of the frames so far.
+    sent: Vec<Vec<u8>>,
     frames: Vec<StreamFrame>,
     /// Of all pictures: squared error, pixels, FLIP, pictures.
     squares: f64,
@@ -552,7 +638,6 @@ struct StreamFrame {
     frame_ms: f64,
     encode_ms: f64,
     select_ms: f64,
-    decode_ms: f64,
     rmse_255: f64,
     points: u64,
 }
@@ -562,15 +647,18 @@ impl Stream {
         let scene_hash = world.scene.hash();
         let mut encoder = Encoder::new(world, scheme, 0);
         let bytes = encoder.header(world, scene_hash, rate_hz as f32);
+        let config = Config {
+            capacity: capacity_of(world),
+            scene_hash,
+        };
         Stream {
             scheme,
             encoder,
-            client: Client::new(Config {
-                capacity: capacity_of(world),
-                scene_hash,
-            }),
+            client: Client::new(config),
+            config,
             before: vec![Cell::default(); capacity_of(world).cells as usize],
             bytes,
+            sent: Vec::new(),
             frames: Vec::new(),
             squares: 0.0,
             pixels: 0.0,
@@ -586,17 +674,9 @@ impl Stream {
         let stats = encoder.frame(world, time_ns, sight, true, bytes);
         let frame_ms = ms(start);
         let encode_ms = stats.encode_ns as f64 * 1e-6;
-        let start = Instant::now();
-        let (mut rest, mut shown) = (&self.bytes[..], None);
-        while !rest.is_empty() {
-            let pushed = self.client.push(rest).map_err(|error| error.to_string())?;
-            rest = &rest[pushed.consumed..];
-            shown = pushed.frame.or(shown);
-        }
-        let decode_ms = ms(start);
+        let shown = push(&mut self.client, &self.bytes)?;
         let (mine, theirs) = (self.client.mirror(), self.encoder.mirror());
-        let shown = shown.is_some_and(|frame| frame.id == self.encoder.frame_id());
-        if !shown || mine.hash() != theirs.hash() {
+        if shown != Some(self.encoder.frame_id()) || mine.hash() != theirs.hash() {
             let frame = self.encoder.frame_id();
             return Err(format!(
                 "{}: the client's mirror is not the server's after frame {frame}; please report it",
@@ -627,12 +707,11 @@ impl Stream {
             encode_ms,
             // Coding, where it had two threads, is counted twice.
             select_ms: (frame_ms - encode_ms).max(0.0),
-            decode_ms,
             rmse_255,
             points,
         });
         self.client.clear_dirty();
-        self.bytes.clear();
+        self.sent.push(std::mem::take(&mut self.bytes));
         Ok(())
     }
 
@@ -665,7 +744,6 @@ impl Stream {
             self.frames[steady..].iter().map(value).collect()
         };
         let kbits = self.kbits();
-        let decode = of(&|frame| frame.decode_ms);
         let seen = self.pictures > 0.0;
         let error = (self.squares / self.pixels).max(1e-12);
         Row {
@@ -685,8 +763,6 @@ impl Stream {
             rmse_255: mean(&of(&|frame| frame.rmse_255 * frame.rmse_255)).sqrt(),
             psnr_db: seen.then(|| -10.0 * error.log10()),
             flip: seen.then(|| self.flip / self.pictures),
-            decode_ms: percentile(&decode, 0.5),
-            decode_p99_ms: percentile(&decode, 0.99),
             encode_ms: percentile(&of(&|frame| frame.encode_ms), 0.5),
             select_ms: percentile(&of(&|frame| frame.select_ms), 0.5),
             points_changed_per_frame: mean(&of(&|frame| frame.points as f64)),
