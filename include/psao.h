@@ -276,7 +276,7 @@ typedef struct psao_stats {
   /* How much later it came than the fastest frame of this stream, by your clock: what waits on
    * the way. */
   uint64_t delay_ns;
-  /* Hash of its mirror, the server's word for the same bytes. */
+  /* Hash of its mirror. The server says the upper half with each frame, of the bytes it means. */
   uint64_t mirror_hash;
   /* Bytes pushed and used. */
   uint64_t stream_bytes;

@@ -243,7 +243,7 @@ pub struct psao_stats {
     /// How much later it came than the fastest frame of this stream, by your clock: what waits on
     /// the way.
     pub delay_ns: u64,
-    /// Hash of its mirror, the server's word for the same bytes.
+    /// Hash of its mirror. The server says the upper half with each frame, of the bytes it means.
     pub mirror_hash: u64,
     /// Bytes pushed and used.
     pub stream_bytes: u64,

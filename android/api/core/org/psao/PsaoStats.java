@@ -38,7 +38,7 @@ public final class PsaoStats {
     }
 
     /**
-     * Hash of its mirror, the server's word for the same bytes.
+     * Hash of its mirror. The server says the upper half with each frame, of the bytes it means.
      *
      * @return 64 bits
      */
