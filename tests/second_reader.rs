@@ -121,7 +121,8 @@ fn read_stream(bytes: &[u8], room: Room, kept: &mut Kept, out: &mut Read) -> Res
 
         // 2.6
         let allowed = match kind {
-            2 | 5 => 0b11,
+            2 => 0b11,
+            5 => 0b1111,
             1 | 3 | 4 | 6 => 0,
             _ => 0xff,
         };
@@ -183,7 +184,9 @@ fn read_stream(bytes: &[u8], room: Room, kept: &mut Kept, out: &mut Read) -> Res
                 if kind == 2 {
                     apply(&body[16..], header, &slices, &mut mirror)?;
                 } else {
-                    apply_items(&body[16..], header, &kept.patches, &mut mirror, &mut slices)?;
+                    let step = (i64::from(header.step) << (flags >> 2)).min(255);
+                    let patches = &kept.patches;
+                    apply_items(&body[16..], header, step, patches, &mut mirror, &mut slices)?;
                 }
                 if !last {
                     continue;
@@ -454,6 +457,7 @@ impl Slice {
 fn apply_items(
     content: &[u8],
     header: &Header,
+    step: i64,
     patches: &HashMap<u32, Vec<u8>>,
     mirror: &mut [Buffer; 3],
     slices: &mut BTreeMap<u32, Slice>,
@@ -507,7 +511,7 @@ fn apply_items(
             }
         }
         let data = take(content, &mut at)?;
-        let step = if open { 1 } else { i64::from(header.step) };
+        let step = if open { 1 } else { step };
         decode(data, open, step, slice)?;
         // 15.8
         for point in &slice.points {

@@ -255,6 +255,13 @@ impl Encoder {
         }
     }
 
+    /// [`Limits::max_mbit`] from the next frame on; profile `cells` has no such limit.
+    pub fn set_max_mbit(&mut self, max_mbit: f64) {
+        if let Sent::Residual(sent) = &mut self.sent {
+            sent.set_max_mbit(max_mbit);
+        }
+    }
+
     /// What the world changed in a step. To be called after every step, sent or not.
     pub fn merge(&mut self, world: &World) {
         match &mut self.sent {
@@ -275,6 +282,7 @@ impl Encoder {
     ) -> FrameStats {
         let start = out.len();
         let mut stats = FrameStats::default();
+        let mut coarse = 0;
         let mut packets = match &mut self.sent {
             Sent::Cells(sent) => sent.frame(world, view, &mut stats),
             Sent::Residual(sent) => {
@@ -285,6 +293,7 @@ impl Encoder {
                 }
                 stats.encode_ns += packing.elapsed().as_nanos() as u64;
                 stats.patch_bytes = (out.len() - start) as u64;
+                coarse = frame.coarse;
                 frame.packets
             }
         };
@@ -295,7 +304,7 @@ impl Encoder {
         if !packets.is_empty() {
             let packing = Instant::now();
             self.frame_id += 1;
-            self.write_frame(&packets, time_ns, out);
+            self.write_frame(&packets, coarse, time_ns, out);
             stats.encode_ns += packing.elapsed().as_nanos() as u64;
         }
         stats.bytes = (out.len() - start) as u64;
@@ -306,9 +315,18 @@ impl Encoder {
         stats
     }
 
-    fn write_frame(&mut self, packets: &[(u8, Vec<u8>)], time_ns: u64, out: &mut Vec<u8>) {
+    fn write_frame(
+        &mut self,
+        packets: &[(u8, Vec<u8>)],
+        coarse: u8,
+        time_ns: u64,
+        out: &mut Vec<u8>,
+    ) {
         for (index, (kind, body)) in packets.iter().enumerate() {
             let mut flags = 0;
+            if *kind == kind::SLICES {
+                flags |= coarse << flag::COARSE.trailing_zeros();
+            }
             let mut frame = Frame {
                 id: self.frame_id,
                 time_ns,

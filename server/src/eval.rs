@@ -89,6 +89,15 @@ pub struct EvalArgs {
     /// itself; 0 for all points always. More rows of --size ask for more points
     #[arg(long, value_name = "N,...", value_delimiter = ',', default_value = "0")]
     pub points_per_pixel: Vec<f32>,
+    /// Most bits a second in the steady frames, in millions (profile residual), each measured by
+    /// itself; 0 for no limit
+    #[arg(
+        long,
+        value_name = "MBIT,...",
+        value_delimiter = ',',
+        default_value = "0"
+    )]
+    pub max_mbit: Vec<f64>,
     /// Frames at each rate. The first second is reported apart; of less than two seconds, the
     /// first half where that is shorter
     #[arg(long, value_name = "N", default_value_t = 60,
@@ -172,6 +181,8 @@ pub struct Row {
     pub quant: String,
     /// Points a pixel that far instances are thinned to; 0 for all points.
     pub points_per_pixel: f32,
+    /// Most megabits a second in the steady frames; 0 for no limit.
+    pub max_mbit: f64,
     /// Megabits per second of scene time.
     pub mbit_per_s: f64,
     /// The part of it that is occlusion alone, in slices packets (profile `residual`).
@@ -218,7 +229,8 @@ pub struct Row {
     pub first_frame_bytes: u64,
 }
 
-/// Profile `cells` against profile `residual` at the point error of `cells`.
+/// Profile `cells` against profile `residual` at the point error of `cells`, neither with a limit
+/// of bits.
 #[derive(Clone, Debug, Serialize)]
 pub struct Comparison {
     /// Points per square metre and side.
@@ -277,6 +289,7 @@ pub fn run(args: &EvalArgs, progress: Progress<'_>) -> Result<Evaluation, String
         ("--densities", args.densities.len()),
         ("--steps", args.steps.len()),
         ("--points-per-pixel", args.points_per_pixel.len()),
+        ("--max-mbit", args.max_mbit.len()),
     ] {
         if count > MAX_VALUES {
             return Err(format!("{name} takes at most {MAX_VALUES} values"));
@@ -288,6 +301,9 @@ pub fn run(args: &EvalArgs, progress: Progress<'_>) -> Result<Evaluation, String
     let usable = |points: &f32| points.is_finite() && *points >= 0.0;
     if !args.points_per_pixel.iter().all(usable) {
         return Err("--points-per-pixel must be 0 (all points always) or more".into());
+    }
+    if !args.max_mbit.iter().all(|m| m.is_finite() && *m >= 0.0) {
+        return Err("--max-mbit must be 0 (no limit) or more".into());
     }
     let mut bench = Bench {
         args,
@@ -378,12 +394,16 @@ impl Bench<'_> {
             ProfileArg::Cells => vec![vec![CELLS]],
             ProfileArg::Residual => {
                 let group = |&points_per_pixel: &f32| {
-                    let limits = Limits {
-                        points_per_pixel,
-                        ..Limits::default()
-                    };
-                    let scheme = |&quantiser| Scheme::Residual(quantiser, limits);
-                    args.steps.iter().map(scheme).collect()
+                    let schemes = args.max_mbit.iter().flat_map(|&max_mbit| {
+                        let limits = Limits {
+                            max_mbit,
+                            points_per_pixel,
+                            ..Limits::default()
+                        };
+                        let scheme = move |&quantiser| Scheme::Residual(quantiser, limits);
+                        args.steps.iter().map(scheme)
+                    });
+                    schemes.collect()
                 };
                 args.points_per_pixel.iter().map(group).collect()
             }
@@ -461,12 +481,15 @@ impl Bench<'_> {
             let step = world.step(time, &visible, u64::MAX);
             step_ms.push(ms(start));
             rays.push(step.rays as f64);
+            let first = left_out(args.frames, rate_hz);
             for stream in &mut streams {
+                if frame == first {
+                    stream.limit();
+                }
                 stream.frame(world, (time * 1e9) as u64, &sight)?;
             }
             world.clear_changes();
             // The middle of each of as many equal parts of the steady frames.
-            let first = left_out(args.frames, rate_hz);
             let steady = args.frames - first;
             let pictures = args.pictures.min(steady);
             let middle = |i| first + (2 * i + 1) * steady / (2 * pictures);
@@ -645,7 +668,11 @@ struct StreamFrame {
 impl Stream {
     fn new(world: &World, scheme: Scheme, rate_hz: f64) -> Stream {
         let scene_hash = world.scene.hash();
-        let mut encoder = Encoder::new(world, scheme, 0);
+        let mut unlimited = scheme;
+        if let Scheme::Residual(_, limits) = &mut unlimited {
+            limits.max_mbit = 0.0;
+        }
+        let mut encoder = Encoder::new(world, unlimited, 0);
         let bytes = encoder.header(world, scene_hash, rate_hz as f32);
         let config = Config {
             capacity: capacity_of(world),
@@ -664,6 +691,13 @@ impl Stream {
             pixels: 0.0,
             flip: 0.0,
             pictures: 0.0,
+        }
+    }
+
+    /// From the next frame on, the stream's limit of bits holds.
+    fn limit(&mut self) {
+        if let Scheme::Residual(_, limits) = self.scheme {
+            self.encoder.set_max_mbit(limits.max_mbit);
         }
     }
 
@@ -746,16 +780,18 @@ impl Stream {
         let kbits = self.kbits();
         let seen = self.pictures > 0.0;
         let error = (self.squares / self.pixels).max(1e-12);
+        let limits = match self.scheme {
+            Scheme::Cells { .. } => Limits::default(),
+            Scheme::Residual(_, limits) => limits,
+        };
         Row {
             profile: match self.scheme {
                 Scheme::Cells { .. } => ProfileArg::Cells.name(),
                 Scheme::Residual(..) => ProfileArg::Residual.name(),
             },
             quant: name_of(self.scheme),
-            points_per_pixel: match self.scheme {
-                Scheme::Cells { .. } => 0.0,
-                Scheme::Residual(_, limits) => limits.points_per_pixel,
-            },
+            points_per_pixel: limits.points_per_pixel,
+            max_mbit: limits.max_mbit,
             mbit_per_s: mean(&kbits[steady..]) * rate_hz / 1e3,
             mbit_per_s_slices: mean(&of(&|frame| frame.slices_bytes as f64)) * 8e-6 * rate_hz,
             mbit_per_s_topology: mean(&of(&|frame| frame.topology_bytes as f64)) * 8e-6 * rate_hz,
@@ -793,6 +829,15 @@ fn name_of(scheme: Scheme) -> String {
             format!("step {step}, dead zone {dead_zone}")
         }
     }
+}
+
+/// Level of detail and budget in words.
+fn limits(row: &Row) -> String {
+    let budget = match row.max_mbit {
+        0.0 => String::new(),
+        mbit => format!(" in {mbit} Mbit/s"),
+    };
+    per_pixel(row.points_per_pixel) + &budget
 }
 
 /// Level of detail in words.
@@ -881,7 +926,7 @@ impl Evaluation {
                 .collect()
         };
         let mut residual = of(ProfileArg::Residual);
-        residual.retain(|row| row.points_per_pixel == points_per_pixel);
+        residual.retain(|row| row.points_per_pixel == points_per_pixel && row.max_mbit == 0.0);
         let off = |row: &Row, from: f64| (row.rmse_255 - from).abs();
         let Some(cells) = of(ProfileArg::Cells).first().copied() else {
             return;
@@ -918,6 +963,7 @@ impl Evaluation {
             "quantiser",
             "/m²",
             "/pixel",
+            "at most",
             "Hz",
             "Mbit/s",
             "slices",
@@ -951,6 +997,10 @@ impl Evaluation {
                 match row.points_per_pixel {
                     0.0 => "all".into(),
                     points => points.to_string(),
+                },
+                match row.max_mbit {
+                    0.0 => "-".into(),
+                    mbit => mbit.to_string(),
                 },
                 row.rate_hz.to_string(),
                 format!("{:.2}", row.mbit_per_s),
@@ -1033,7 +1083,7 @@ impl Evaluation {
     fn growth(&self) -> Vec<Plot> {
         let mut runs: Vec<(String, Vec<&Row>)> = Vec::new();
         for row in &self.rows {
-            let thinned = per_pixel(row.points_per_pixel);
+            let thinned = limits(row);
             let run = format!("{} {}{thinned}, {} Hz", row.profile, row.quant, row.rate_hz);
             match runs.iter_mut().find(|(name, _)| *name == run) {
                 Some((_, rows)) => rows.push(row),
@@ -1078,7 +1128,7 @@ impl Evaluation {
                     row.profile,
                     row.quant,
                     row.density,
-                    per_pixel(row.points_per_pixel),
+                    limits(row),
                     row.rate_hz
                 ),
                 format!(
@@ -1101,7 +1151,7 @@ impl Evaluation {
                     rate_hz,
                     ..
                 } = row;
-                let thinned = per_pixel(row.points_per_pixel);
+                let thinned = limits(row);
                 let name = format!("{profile}, {density}/m²{thinned}, {rate_hz} Hz");
                 if curves.last().is_none_or(|(last, _)| *last != name) {
                     curves.push((name, Vec::new()));
@@ -1152,7 +1202,7 @@ impl Evaluation {
         for (row, kbits) in self.rows.iter().zip(&self.kbits) {
             let key = (row.density.to_bits(), row.rate_hz.to_bits());
             let times = (0..).map(|frame| f64::from(frame) / row.rate_hz);
-            let thinned = per_pixel(row.points_per_pixel);
+            let thinned = limits(row);
             let name = format!("{} {}{thinned}", row.profile, row.quant);
             let line = times.zip(kbits.iter().copied()).collect();
             over_time.entry(key).or_default().push((name, line));

@@ -364,6 +364,7 @@ fn valid(recorded: &Files, invalid: &[Invalid]) -> Vec<Valid> {
             None,
             recorded["presence"].clone(),
         ),
+        ("budget", "2.6,15.13", None, recorded["budget"].clone()),
         (
             "cut-off",
             "2.5,3.3",
@@ -900,6 +901,12 @@ fn broken_slices(parts: &Parts) -> Vec<Invalid> {
     let shown = [&head(1)[..], &vec![0xff; opening.shown.len()], &[0]].concat();
     vec![
         ("step-zero", "4.1", FORMAT, header(49, &[0])),
+        (
+            "coarse-patches",
+            "2.6",
+            FORMAT,
+            parts.changed(|list| list[at].1 = 4),
+        ),
         (
             "too-many-cells-for-slices",
             "4.1",

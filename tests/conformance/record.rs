@@ -5,13 +5,14 @@ use super::small_scene::{STILL, small_scene, still_scene};
 use glam::Vec3;
 use psao_core::Kernel;
 use psao_core::residual::Quantiser;
+use psao_core::stream::{PREAMBLE, Packet, flag};
 use psao_server::camera::Camera;
 use psao_server::encode::{Compression, Encoder, Eye, Limits, Scheme, View, capacity_of};
 use psao_server::scene::Scene;
 use psao_server::world::{Options, World};
 
 /// All of them.
-pub const RECORDED: [&str; 7] = [
+pub const RECORDED: [&str; 8] = [
     "cells",
     "residual",
     "topology",
@@ -19,6 +20,7 @@ pub const RECORDED: [&str; 7] = [
     "levels",
     "reopen",
     "presence",
+    "budget",
 ];
 
 /// Frames a second of all of them: few, so that a change of level fades in two frames.
@@ -107,6 +109,25 @@ pub fn record(name: &str) -> Vec<u8> {
                 Shot::default()
             });
             assert!(take.closed > 0 && take.opened > take.closed);
+            out
+        }
+        "budget" => {
+            // Enough for what there is at first; then too little for what moves, and at last enough.
+            let mut take = Take::new(small_scene(), 60.0, plain, |_| 0);
+            let out = take.frames(16, |take, frame| {
+                if let Some(max_mbit) = [(2, 0.003), (10, 1.0)].into_iter().find(|on| on.0 == frame)
+                {
+                    take.encoder.set_max_mbit(max_mbit.1);
+                }
+                Shot::default()
+            });
+            let mut rest = &out[PREAMBLE.len()..];
+            let mut coarse = std::collections::BTreeSet::new();
+            while let Some((packet, length)) = Packet::read(rest, u32::MAX).unwrap() {
+                coarse.insert(packet.flags & flag::COARSE);
+                rest = &rest[length..];
+            }
+            assert_eq!(coarse.len(), 4, "{coarse:?}");
             out
         }
         _ => panic!("{name} is none of the recordings"),

@@ -402,6 +402,13 @@ impl Coded {
         }
     }
 
+    /// The flags of packets of later items, which are coded so much coarser from now on.
+    pub fn coarsen(&mut self, header: &Header, doublings: u8) -> u8 {
+        let flags = doublings << flag::COARSE.trailing_zeros();
+        self.step = header.step_of(flags);
+        flags
+    }
+
     pub fn reset(&mut self) {
         let cells = self.mirror.capacity().cells;
         self.mirror.reset();
@@ -617,7 +624,7 @@ fn made_patch(what: What, index: u32) -> Vec<u8> {
 
 /// A shadow wanders over slices that open, close and open again; after half of the frames one
 /// instance changes its level, after two thirds is a snapshot. In some frames some slices stay as
-/// they are, and the blocks in cells change.
+/// they are, and the blocks in cells change. Every two frames have another step.
 pub fn made(what: What) -> Sample {
     let header = made_header(what);
     let buckets = made_buckets(what);
@@ -676,6 +683,7 @@ pub fn made(what: What) -> Sample {
             let dark = 200usize.saturating_sub(off) + (at * 7 + noise) % 5;
             255 - if dark > 4 { dark as u8 } else { 0 }
         };
+        let coarse = coded.coarsen(&header, (frame / 2 % 4) as u8);
         let mut list = Vec::new();
         for index in 0..slices {
             let (patch, was) = (index % what.patches, open[index as usize]);
@@ -700,10 +708,10 @@ pub fn made(what: What) -> Sample {
         // The last frame in two packets, the second without anything.
         let hash = coded.mirror.hash();
         if frame + 1 == what.frames {
-            hand.slices(0, frame + 1, 0, &items(&list));
+            hand.slices(coarse, frame + 1, 0, &items(&list));
             hand.slices(flag::LAST, frame + 1, hash, &[]);
         } else {
-            hand.slices(flag::LAST, frame + 1, hash, &items(&list));
+            hand.slices(coarse | flag::LAST, frame + 1, hash, &items(&list));
         }
         mirrors.insert(frame + 1, contents(&coded.mirror));
     }

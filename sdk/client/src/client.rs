@@ -465,7 +465,8 @@ impl Decoder {
         }
         self.next_sequence = packet.sequence.wrapping_add(1);
         match packet.kind {
-            kind::FRAME | kind::SLICES => packet.check_flags(flag::SNAPSHOT | flag::LAST)?,
+            kind::FRAME => packet.check_flags(flag::SNAPSHOT | flag::LAST)?,
+            kind::SLICES => packet.check_flags(flag::SNAPSHOT | flag::LAST | flag::COARSE)?,
             kind::HEADER | kind::END | kind::REFUSE | kind::PATCHES => packet.check_flags(0)?,
             _ => {}
         }
@@ -567,7 +568,8 @@ impl Decoder {
         self.partial = true;
         if packet.kind == kind::SLICES {
             let slices = &mut self.slices.slices();
-            let count = apply_slices(content, header.step, &mut self.mirror, slices)?;
+            let step = header.step_of(packet.flags);
+            let count = apply_slices(content, step, &mut self.mirror, slices)?;
             self.stats.slices += u64::from(count);
         } else if !content.is_empty() {
             let mut reader = Reader(content);

@@ -66,6 +66,9 @@ pub mod flag {
     pub const SNAPSHOT: u8 = 1;
     /// Frame: the frame is complete with this packet, and `mirror_check` holds.
     pub const LAST: u8 = 2;
+    /// Slices: two bits, by how many doublings the items' step is coarser than the header's. See
+    /// [`super::Header::step_of`].
+    pub const COARSE: u8 = 12;
     /// Any unknown kind: may be skipped by a reader that does not know it.
     pub const OPTIONAL: u8 = 128;
 }
@@ -337,6 +340,12 @@ pub fn write_packet(
 }
 
 impl Header {
+    /// The step of later items in a slices packet with these [`flag`]s.
+    pub fn step_of(&self, flags: u8) -> u8 {
+        let doublings = (flags & flag::COARSE) >> flag::COARSE.trailing_zeros();
+        self.step.saturating_mul(1 << doublings)
+    }
+
     /// Reads a header packet's body. Bytes after the known fields belong to a newer minor
     /// version and are ignored.
     pub fn read(body: &[u8]) -> Result<Header, StreamError> {

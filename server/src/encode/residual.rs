@@ -59,6 +59,16 @@ const LITTLE_A_POINT: u64 = 25;
 /// No slice waits longer for being little off.
 const WAIT_S: f32 = 0.1;
 
+/// Once slices have waited for room for so long, occlusion is sent in steps twice as coarse: much
+/// nearer for all beats exact for few.
+const STRAINED_S: f32 = 0.25;
+
+/// Once none has for so long, in steps half as coarse.
+const EASED_S: f32 = 0.1;
+
+/// Most doublings of the step: what the packets' flags have room for.
+const COARSEST: u8 = 3;
+
 /// What a client of profile `residual` has.
 pub struct Residual {
     pub mirror: Mirror<Heap>,
@@ -83,6 +93,13 @@ pub struct Residual {
     cells: Option<Vec<u32>>,
     /// Bytes sent beyond the budget so far.
     debt: f64,
+    /// Doublings of the step that the budget asks for now.
+    coarse: u8,
+    /// Frames, since the step changed last or this began, after each of which slices waited for
+    /// room; below 0, frames after which none did.
+    strained: i32,
+    /// Of each slice, what its visible errors came to in the frames in which it waited for room.
+    owed: Vec<f32>,
 }
 
 /// Occlusion that a slice's points begin with, so that the picture does not jump.
@@ -97,6 +114,8 @@ pub struct Packets {
     pub patches: Vec<Vec<u8>>,
     /// Kind and content of the frame's packets.
     pub packets: Vec<(u8, Vec<u8>)>,
+    /// Doublings of the step in those of slices.
+    pub coarse: u8,
 }
 
 /// A slice that the client lacks something of.
@@ -166,6 +185,9 @@ impl Residual {
             space: Space::new(capacity.points),
             cells: scarce.then(|| vec![0; world.slices.len()]),
             debt: 0.0,
+            coarse: 0,
+            strained: 0,
+            owed: vec![0.0; world.slices.len()],
         }
     }
 
@@ -230,6 +252,14 @@ impl Residual {
         }
     }
 
+    /// [`Limits::max_mbit`] from the next frame on.
+    pub fn set_max_mbit(&mut self, max_mbit: f64) {
+        self.limits.max_mbit = max_mbit;
+        if max_mbit == 0.0 {
+            (self.debt, self.coarse, self.strained) = (0.0, 0, 0);
+        }
+    }
+
     /// Bytes a frame.
     fn budget(&self) -> f64 {
         self.limits.max_mbit * 1e6 / 8.0 / f64::from(self.rate_hz.max(1.0))
@@ -258,6 +288,12 @@ impl Residual {
             if whole { &mut now } else { &mut later }.push(lack);
         }
         if room.is_finite() {
+            // So that what is less off in every frame than something else has its turn as well.
+            for lack in &mut later {
+                let owed = &mut self.owed[lack.index as usize];
+                *owed += lack.weight;
+                lack.weight = *owed;
+            }
             later.sort_by(|a, b| b.weight.total_cmp(&a.weight));
         }
         now.append(&mut later);
@@ -265,16 +301,19 @@ impl Residual {
         let mut rest = now.as_slice();
         while !rest.is_empty() {
             if room <= 0.0 {
-                stats.waiting = rest.len() as u32;
+                stats.waiting += rest.len() as u32;
                 break;
             }
-            let (batch, after) = rest.split_at(rest.len().min(BATCH));
+            // Few slices take less than 16 bytes: no more are coded than may find room.
+            let most = ((room / 16.0) as usize).clamp(4, BATCH);
+            let (batch, after) = rest.split_at(rest.len().min(most));
             rest = after;
             self.choose(world, batch, &mut room, &mut chosen, &mut out, stats);
         }
         // In the order in which the client will take them, as cells come about in that order.
         chosen.sort_unstable_by_key(|coded| coded.index);
         for coded in chosen {
+            self.owed[coded.index as usize] = 0.0;
             self.apply(world, coded, &mut out, stats);
         }
         let heap = self.heap.get();
@@ -284,7 +323,34 @@ impl Residual {
         let start = Instant::now();
         let packets = out.write(self, world, stats);
         stats.encode_ns += start.elapsed().as_nanos() as u64;
+        if room.is_finite() {
+            self.strain(stats.waiting > 0);
+        }
         packets
+    }
+
+    /// Fits the step to the budget: after a frame, by whether slices wait for room.
+    fn strain(&mut self, waiting: bool) {
+        self.strained = match waiting {
+            true => self.strained.max(0) + 1,
+            false => self.strained.min(0) - 1,
+        };
+        let frames = |seconds: f32| (seconds * self.rate_hz).ceil() as i32;
+        if self.strained >= frames(STRAINED_S) {
+            (self.coarse, self.strained) = ((self.coarse + 1).min(COARSEST), 0);
+        } else if self.strained <= -frames(EASED_S) {
+            (self.coarse, self.strained) = (self.coarse.saturating_sub(1), 0);
+        }
+    }
+
+    /// How slices are coded now that were before.
+    fn quantiser(&self) -> Quantiser {
+        let Quantiser { step, dead_zone } = self.quantiser;
+        let coarser = |by: u8| by.saturating_mul(1 << self.coarse);
+        Quantiser {
+            step: coarser(step),
+            dead_zone: coarser(dead_zone.saturating_add(1)) - 1,
+        }
     }
 
     /// The slices in sight that the client does not have, or that differ where it shows by more than
@@ -301,7 +367,10 @@ impl Residual {
             self.due[lack.index as usize] &= !lack.near_enough;
             let since = &mut self.little_since[lack.index as usize];
             match off {
-                Off::Near => *since = None,
+                Off::Near => {
+                    *since = None;
+                    self.owed[lack.index as usize] = 0.0;
+                }
                 Off::Little => *since = since.or(Some(self.sight.frames())),
                 Off::Far => lacks.push(lack),
             }
@@ -342,7 +411,8 @@ impl Residual {
         let level = self.grid(slice).level;
         let asked = if fading { u64::MAX } else { due };
         let have = self.heap.values(open);
-        let differences = Differences::of(world, slice, level, have, asked, self.quantiser);
+        let off_by = |than| Differences::of(world, slice, level, have, asked, than);
+        let differences = off_by(self.quantiser());
         let missing = to_show(world, &self.mirror, slice, open) & !open.shown;
         let differing = differences.blocks();
         let mut shows = missing;
@@ -351,7 +421,12 @@ impl Residual {
             all: differing,
         };
         if !fading {
-            lack.near_enough = due & !differing & !missing;
+            // What is near enough for now counts again once there is room.
+            let at_last = match self.coarse {
+                0 => differing,
+                _ => off_by(self.quantiser).blocks(),
+            };
+            lack.near_enough = due & !at_last & !missing;
             faces = view.blocks(world, slice, due & (differing | missing));
             lack.blocks = faces.any;
             shows &= faces.any;
@@ -375,7 +450,7 @@ impl Residual {
 
     /// Whether a slice that is off by so much, squared and summed and at most, may wait for more.
     fn waits(&self, index: u32, squares: u64, most: u64) -> bool {
-        let least = u64::from(self.quantiser.dead_zone) + 1;
+        let least = u64::from(self.quantiser().dead_zone) + 1;
         let waited =
             self.little_since[index as usize].map_or(0, |since| self.sight.frames() - since);
         // Without a dead zone nothing is to be off.
@@ -736,7 +811,7 @@ impl Residual {
         let quantiser = if opens.is_some() {
             FIRST
         } else {
-            self.quantiser
+            self.quantiser()
         };
         let start = Instant::now();
         let length = encode_slice(
@@ -752,7 +827,7 @@ impl Residual {
         coded.encode_ns = start.elapsed().as_nanos() as u64;
         coded.bytes.truncate(length);
         for (number, (has, wants)) in numbers.zip(coded.values.iter().zip(&target)) {
-            let differs = is_free(number) && !quantiser.leaves(*has, *wants);
+            let differs = !self.quantiser.leaves(*has, *wants);
             coded.left |= u64::from(differs) << (number / BLOCK);
         }
         coded
@@ -944,6 +1019,7 @@ impl Frame {
         Packets {
             patches: sent.patches(world, &self.patches),
             packets,
+            coarse: sent.coarse,
         }
     }
 }
